@@ -1,0 +1,14 @@
+"""The technician's application: finds rigs and procedures by entry point, never by import.
+
+==============  ==========================================================
+cli             the command line, one file per command
+plugins         what entry points offer; a broken one stops nothing
+session         a rig, its lock, its corrections and a run put together
+configuration   ``--set``, parameters, and ``config.toml`` with origins
+corrections     accepted maps applied to a scene
+rendering       a scene file -> the files of its hologram
+capturing       a frame shown and captured at an exposure found for it
+terminal        progress and errors on stderr, results on stdout
+report          a run directory -> one self-contained page
+==============  ==========================================================
+"""

@@ -1,0 +1,12 @@
+"""The command line: one file per command, heavy imports inside the commands.
+
+==============  ==========================================================
+main            the application, and the one place where errors end
+options         options that several commands share
+run, resume     measure; go on
+accept          put a result in force, or the one before
+report, show, verify   read what was done
+render, capture        scene -> frame -> picture
+rigs, procedures, doctor   what there is, and whether it works
+==============  ==========================================================
+"""

@@ -1,0 +1,183 @@
+"""A rig, its lock, its corrections and a procedure put together for one run, fresh or resumed."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from holocal import __version__
+from holocal.app import configuration, plugins
+from holocal.app.report import render_report
+from holocal.errors import DeviceError, RefusedError
+from holocal.loop.devices import Rig
+from holocal.loop.lock import locked
+from holocal.loop.record import RunRecord
+from holocal.loop.runner import Observer, RunResult, run
+from holocal.records import calibration
+from holocal.records.files import read_json
+from holocal.records.rig import RigConfig, identity
+
+LOGGER = logging.getLogger("holocal.app")
+CORRECTIONS = ("accepted", "none")
+
+
+@contextmanager
+def opened_rig(config: RigConfig) -> Iterator[Rig]:
+    """Yield the opened rig of a configuration; it is closed on every way out."""
+    open_rig = plugins.load(plugins.RIGS, config.kind)
+    try:
+        rig: Rig = open_rig(config)
+    except OSError as error:
+        raise DeviceError(
+            f"rig {config.name} cannot be opened: {error}.", fix="Check its cables and power; `holocal doctor`."
+        ) from error
+    try:
+        yield rig
+    finally:
+        rig.close()
+
+
+@contextmanager
+def claimed_rig(config: RigConfig) -> Iterator[Rig]:
+    """Yield the opened rig while no other process has it; `BusyError` when one does."""
+    with locked(calibration.rig_directory(config.name) / "lock", f"rig {config.name}"), opened_rig(config) as rig:
+        yield rig
+
+
+def corrections(choice: str, rig: Mapping[str, Any]) -> dict[str, calibration.Accepted]:
+    """Return the corrections of ``--corrections accepted|none|RUN`` for the rig with this identity."""
+    if choice == "none":
+        return {}
+    if choice == "accepted":
+        return calibration.load(rig)
+    found = calibration.read_run(Path(choice))
+    calibration.check_identity(
+        read_json(Path(choice) / "identity.json"),
+        rig,
+        subject=f"run {found.entry}",
+        fix="Name a run of this rig, or `--corrections none`.",
+    )
+    return {found.procedure: found}
+
+
+def plan(procedure_name: str, rig: RigConfig, overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a run would do (``--dry-run``), JSON-ready; nothing is shown, lit or written."""
+    procedure = plugins.procedure(procedure_name)
+    values, _ = configuration.parameters(
+        procedure.parameters_model, overrides, procedure=procedure_name, device=rig.device
+    )
+    with opened_rig(rig) as device:
+        planned = procedure.plan(device.facts(), values)
+    return {
+        "schema": 1,
+        "dry_run": True,
+        "procedure": procedure_name,
+        "rig": rig.name,
+        **asdict(planned),
+        "parameters": values.model_dump(mode="json"),
+    }
+
+
+def start(
+    procedure_name: str,
+    rig: RigConfig,
+    overrides: Mapping[str, Any],
+    *,
+    seed: int,
+    runs: Path,
+    corrections_choice: str,
+    observer: Observer,
+) -> RunResult:
+    """Return the result of a new run."""
+    procedure = plugins.procedure(procedure_name)
+    values, origins = configuration.parameters(
+        procedure.parameters_model, overrides, procedure=procedure_name, device=rig.device
+    )
+    with claimed_rig(rig) as device:
+        rig_identity = identity(device.facts())
+        in_force = corrections(corrections_choice, rig_identity)
+        entries = {name: found.entry for name, found in in_force.items()}
+        config = configuration.RunConfig(procedure_name, rig, values, origins, seed, entries)
+        record = RunRecord.create(runs, procedure_name, config=config.toml(), identity=rig_identity)
+        with record.open():
+            return run(
+                procedure,
+                device,
+                values,
+                seed=seed,
+                record=record,
+                calibration=in_force,
+                observer=observer,
+                render=safe_report,
+            )
+
+
+def resume(directory: Path, *, observer: Observer) -> RunResult:
+    """Return the result of a run that was cut off, interrupted or lost its device, from its last finished step."""
+    record = RunRecord.reopen(directory)
+    config = record.config()
+    _check_version(directory)
+    rig = configuration.stored_rig(config)
+    procedure = plugins.procedure(config["procedure"])
+    values = configuration.stored_parameters(procedure.parameters_model, config)
+    with claimed_rig(rig) as device, record.open():
+        rig_identity = identity(device.facts())
+        record.check_identity(rig_identity)
+        return run(
+            procedure,
+            device,
+            values,
+            seed=int(config["seed"]),
+            record=record,
+            calibration=_same_corrections(config.get("corrections", {}), rig_identity),
+            observer=observer,
+            render=safe_report,
+        )
+
+
+def _check_version(directory: Path) -> None:
+    began = read_json(directory / "environment.json").get("packages", {}).get("holocal")
+    if began != __version__:
+        raise RefusedError(
+            f"{directory.name} was started with holocal {began}; this is {__version__}.",
+            why="Its two halves would be measured by different rules.",
+            fix="Go on with that version, or start a new run.",
+            measured=__version__,
+            limit=began,
+            code="other-version",
+        )
+
+
+def _same_corrections(began: Mapping[str, str], rig: Mapping[str, Any]) -> dict[str, calibration.Accepted]:
+    if not began:
+        return {}
+    loaded = calibration.load(rig)
+    now = {name: found.entry for name, found in loaded.items()}
+    for name in sorted({*began, *now}):
+        if began.get(name) != now.get(name):
+            raise RefusedError(
+                f"the run was started under {name} = {began.get(name) or 'none'}; "
+                f"in force is {now.get(name) or 'none'}.",
+                why="Its two halves would be measured under different corrections.",
+                fix="`holocal accept --rollback`, or start a new run.",
+                measured=now.get(name),
+                limit=began.get(name),
+                code="other-corrections",
+            )
+    return loaded
+
+
+def safe_report(directory: Path) -> bytes:
+    """Return a run's report; one that says why where it cannot be drawn, since a run must not fail by its report."""
+    try:
+        return render_report(directory)
+    except Exception as error:
+        LOGGER.exception("the report could not be drawn")
+        return (
+            "<!doctype html><html lang='en'><meta charset='utf-8'><title>holocal</title><p>The report could not be "
+            f"drawn ({type(error).__name__}); the numbers are in result.json, the reason is in log.txt.</p></html>"
+        ).encode()

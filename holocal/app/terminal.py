@@ -1,0 +1,108 @@
+"""Progress, tables and errors on stderr; on stdout the result, or with ``--json`` exactly one JSON object.
+
+On a terminal a line says what the run waits for; elsewhere each step is one plain line. ``NO_COLOR`` is honoured.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Mapping
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.status import Status
+
+from holocal.errors import HolocalError
+from holocal.loop.preflight import Check
+from holocal.loop.procedure import Judgement, Outcome
+from holocal.records.files import dump_json
+
+LINE = 110  # characters of a line where there is no terminal to ask
+
+
+def stderr_console() -> Console:
+    """Return a console on stderr: coloured on a terminal unless NO_COLOR is set, plain and unwrapped elsewhere."""
+    plain = not sys.stderr.isatty() or bool(os.environ.get("NO_COLOR")) or os.environ.get("TERM") == "dumb"
+    width = None if sys.stderr.isatty() else LINE
+    return Console(stderr=True, no_color=plain, highlight=False, soft_wrap=True, width=width, emoji=False)
+
+
+def emit_json(value: Mapping[str, Any]) -> None:
+    """Write one JSON object to stdout."""
+    sys.stdout.write(dump_json(value, indent=1) + "\n")
+    sys.stdout.flush()
+
+
+def emit(text: str) -> None:
+    """Write a line of a result to stdout."""
+    sys.stdout.write(text + "\n")
+
+
+def show_error(error: HolocalError) -> None:
+    """Write one message to stderr: what happened, why it matters, what to do."""
+    console = stderr_console()
+    console.print(f"[bold red]error[/] {escape(error.code)}: {escape(error.what)}")
+    for part in (error.why, error.fix):
+        if part:
+            console.print(f"  {escape(part)}")
+
+
+class Terminal:
+    """The observer that a technician sees."""
+
+    def __init__(self) -> None:
+        self._console = stderr_console()
+        live = self._console.is_terminal and not self._console.is_dumb_terminal
+        self._status: Status | None = self._console.status("") if live else None
+        self._header = False
+
+    def __enter__(self) -> Terminal:
+        if self._status is not None:
+            self._status.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._status is not None:
+            self._status.stop()
+
+    def say(self, text: str, style: str = "") -> None:
+        """Write a line."""
+        self._console.print(escape(text), style=style or None)
+
+    def preflight(self, checks: list[Check], seconds: float) -> None:
+        """Write the pre-flight's sum, and each check that failed."""
+        failed = [item for item in checks if item.verdict == "fail"]
+        passed = len(checks) - len(failed)
+        self.say(f"pre-flight  {passed} of {len(checks)} passed in {seconds:.1f} s", "red" if failed else "")
+        for item in failed:
+            self.say(f"  {item.id} {item.title}: {item.measured} {item.unit}, limit {item.limit}. {item.remedy}", "red")
+
+    def waiting(self, what: str) -> None:
+        """Say what the run waits for, where there is a terminal."""
+        if self._status is not None:
+            self._status.update(escape(f"{what} ..."))
+
+    def incident(self, sentence: str) -> None:
+        """Write a bad frame or a halved exposure."""
+        self.say(f"  ! {sentence}", "yellow")
+
+    def step(self, number: int, progress: Mapping[str, Any], judgement: Judgement) -> None:
+        """Write a step as a line of the table: the goal's number with its sigma, and the target."""
+        quantity = str(progress.get("quantity", "value"))
+        if not self._header:
+            self._header = True
+            self.say(f" step  {quantity:<28}  {'target':>9}  ", "bold")
+        value = _with_sigma(progress.get("value"), progress.get("sigma"))
+        met = judgement.outcome is Outcome.TARGET_MET
+        text = f" {number:>4}  {value:<28}  {_number(progress.get('target')):>9}  {judgement.sentence}"
+        self.say(text, "green" if met else "")
+
+
+def _with_sigma(value: Any, sigma: Any) -> str:
+    return _number(value) + (f" +- {_number(sigma)}" if sigma is not None else "")
+
+
+def _number(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, (int, float)) else ("-" if value is None else str(value))

@@ -1,0 +1,91 @@
+"""From an encoded field to what the panel is sent: phase, levels, packing.
+
+Level L stands for the phase 2 pi L / 256, or for entry L of a measured response. Positive phase is delay; the field is
+exp(+i phase).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from holocal.errors import InputError
+from holocal.hologram.series import Series
+from holocal.optics.bench import Panel
+
+LEVELS = 256
+_FINE = 16384  # phases that a measured response is tabulated at: 1/64 of a level
+_BLOCK = 128  # rows at a time: float64 work that stays in the cache
+
+
+def panel_phase(field: torch.Tensor, reference_turns: Series, panel: Panel) -> NDArray[np.float32]:
+    """Return the phase the panel must add, (rows, columns) float32 in [0, 2 pi).
+
+    The encoded field's phase, plus the reference it was divided by, minus the illumination's own phase: the thesis's
+    linear phase term, which puts the signal midway between orders 0 and 1.
+    """
+    in_y, in_x = reference_turns.bases(panel.x_m, panel.y_m)
+    columns = torch.from_numpy(reference_turns.coefficients @ in_x.T)
+    fx, fy = panel.illumination_frequency_per_m
+    along_x, along_y = torch.from_numpy(fx * panel.x_m), torch.from_numpy(fy * panel.y_m)
+    rows = torch.from_numpy(in_y)
+    out = torch.empty((panel.height, panel.width), dtype=torch.float32)
+    for top in range(0, panel.height, _BLOCK):
+        part = slice(top, top + _BLOCK)
+        turns = rows[part] @ columns
+        turns.sub_(along_x).sub_(along_y[part, None])
+        turns.add_(torch.angle(field[part]).to("cpu"), alpha=1 / (2 * np.pi))
+        turns.sub_(torch.floor(turns))
+        out[part] = turns.mul_(2 * np.pi)
+    return np.asarray(out.where(out < 2 * np.pi, torch.zeros(())).numpy())
+
+
+def phase_to_levels(phase_rad: NDArray[np.float32], response_rad: ArrayLike | None = None) -> NDArray[np.uint8]:
+    """Return the nearest levels, uint8, to phases of any value.
+
+    Parameters
+    ----------
+    phase_rad
+        (rows, columns) radians.
+    response_rad
+        (256,) the phase that each level really gives; default 2 pi L / 256. Distances are taken round the circle, and
+        the smallest of equally good levels is chosen.
+    """
+    if response_rad is None:
+        steps = torch.from_numpy(np.ascontiguousarray(phase_rad)) * (LEVELS / (2 * np.pi))
+        return np.asarray(steps.round_().to(torch.int32).bitwise_and_(LEVELS - 1).to(torch.uint8).numpy(), np.uint8)
+    table = _nearest_levels(response_rad)
+    index = np.rint(np.asarray(phase_rad, np.float64) * (_FINE / (2 * np.pi))).astype(np.int64) % _FINE
+    levels: NDArray[np.uint8] = table[index]
+    return levels
+
+
+def _nearest_levels(response_rad: ArrayLike) -> NDArray[np.uint8]:
+    """Return the nearest level to each of _FINE phases round the circle."""
+    response = np.asarray(response_rad, np.float64)
+    if response.shape != (LEVELS,) or not np.all(np.isfinite(response)):
+        raise InputError(f"A phase response has {LEVELS} finite entries; this one has shape {response.shape}.")
+    phase = 2 * np.pi * np.arange(_FINE) / _FINE
+    distance = np.abs(np.angle(np.exp(1j * (phase[:, None] - response[None, :]))))
+    return np.asarray(np.argmin(np.round(distance, 12), axis=1), np.uint8)
+
+
+def pack_rgb(levels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return the 24-bit image, (rows, columns, 3), that the thesis's panel takes: levels in red, nothing elsewhere."""
+    packed = np.zeros((*levels.shape, 3), np.uint8)
+    packed[..., 0] = levels
+    return packed
+
+
+def unpack_rgb(packed: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return the levels of a packed frame; refuse one whose green or blue is not zero."""
+    if packed.dtype != np.uint8 or packed.ndim != 3 or packed.shape[2] != 3:
+        raise InputError(f"A packed frame is (rows, columns, 3) of uint8; this is {packed.shape} of {packed.dtype}.")
+    if packed[..., 1:].any():
+        raise InputError(
+            f"{int(np.sum(packed[..., 1:].any(axis=-1)))} pixels of the frame have green or blue light.",
+            why="The panel reads levels from the red channel.",
+            fix="Give a frame written by `holocal render`.",
+        )
+    return np.ascontiguousarray(packed[..., 0])

@@ -1,0 +1,155 @@
+"""What a procedure is to the runner: a handful of pure functions on frozen state.
+
+The runner alone touches devices, disk, clock and signals; a procedure never does. Its randomness comes from
+(seed, step, shot) only, so that a resumed run ends with the same result as an uninterrupted one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel
+
+from holocal.loop.devices import Frame
+from holocal.records.facts import RigFacts
+
+
+class Outcome(Enum):
+    """How a loop stands after a step."""
+
+    CONTINUE = "continue"
+    TARGET_MET = "target met"
+    STALLED = "stalled"
+    DIVERGED = "diverged"
+    OUT_OF_STEPS = "out of steps"
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """Whether to go on, and the sentence that is printed."""
+
+    outcome: Outcome
+    sentence: str
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One frame that a procedure wants.
+
+    `levels` None means a dark frame: light off. `measure` False marks a shot that only sets the exposure.
+    `clip_limit` is the share of pixels that may be at full scale before the runner halves the exposure.
+    """
+
+    label: str
+    levels: NDArray[np.uint8] | None
+    exposure_s: float
+    wavelength_m: float
+    clip_limit: float = 1e-4
+    keep: bool = False
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a run will do, known before anything is touched (``--dry-run``)."""
+
+    frames: int
+    steps: int
+    expected_seconds: float
+    exposure_ceiling_s: float
+    sentences: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A picture for the report: its data, not its drawing. `kind` is "map", "image", "curve", "pair" or "histogram"."""
+
+    name: str
+    title: str
+    kind: str
+    arrays: Mapping[str, NDArray[Any]]
+    unit: str = ""
+    caption: str = ""
+    extent_deg: tuple[float, float, float, float] | None = None  # left, right, bottom, top
+    target: float | None = None
+
+
+@dataclass(frozen=True)
+class Conclusion:
+    """What a procedure found: the numbers of the contract, the maps, the pictures.
+
+    `before`, `after`, `targets` have the contract's keys. `targets_met` is set by the procedure. `maps` go to
+    ``maps.exr`` (name -> (height, width) float32), `before_map` and `after_map` to ``before.exr`` and ``after.exr``;
+    `calibration` holds what `accept` would put in force: JSON scalars here, arrays in `maps`.
+    """
+
+    before: dict[str, Any]
+    after: dict[str, Any]
+    targets: dict[str, float]
+    targets_met: bool
+    sentence: str
+    maps: Mapping[str, NDArray[np.float32]]
+    before_map: NDArray[np.float32]
+    after_map: NDArray[np.float32]
+    map_units: Mapping[str, str] = field(default_factory=dict)
+    extent_deg: tuple[float, float, float, float] | None = None
+    extra: dict[str, Any] = field(default_factory=dict)  # further keys of result.json
+    figures: tuple[Figure, ...] = ()
+
+
+State = TypeVar("State")
+
+
+class Procedure(Protocol[State]):
+    """A closed loop as pure functions. `State` is a frozen dataclass of arrays, numbers, strings and tuples of these.
+
+    The runner does, in this order::
+
+        state = start(facts, calibration, parameters, seed)
+        repeat  frames = [shoot(shot) for shot in stimuli(state)]
+                state = update(state, frames)          # estimate included; journal, then checkpoint
+                judgement = judge(state)               # printed
+        until judgement.outcome is not CONTINUE
+        frames = [shoot(shot) for shot in verification(state)]
+        conclusion = conclude(state, frames)
+    """
+
+    name: str
+    parameters_model: type[BaseModel]
+
+    def plan(self, facts: RigFacts, parameters: Any) -> Plan:
+        """Return what a run would do, touching nothing."""
+        ...
+
+    def start(self, facts: RigFacts, calibration: Mapping[str, Any], parameters: Any, seed: int) -> State:
+        """Return the first state."""
+        ...
+
+    def stimuli(self, state: State) -> Iterator[Shot]:
+        """Yield this step's shots; each is computed only when the runner asks for it."""
+        ...
+
+    def update(self, state: State, frames: tuple[Frame, ...]) -> State:
+        """Return the state after this step's frames, estimate included."""
+        ...
+
+    def progress(self, state: State) -> dict[str, Any]:
+        """Return the journal line of the last step: JSON scalars, the goal's number under "value" and its sigma under
+        "sigma", the target under "target", the unit or name of the number under "quantity"."""
+        ...
+
+    def judge(self, state: State) -> Judgement:
+        """Return whether to go on."""
+        ...
+
+    def verification(self, state: State) -> Iterator[Shot]:
+        """Yield the shots of the verification: fresh frames that no estimate has seen."""
+        ...
+
+    def conclude(self, state: State, frames: tuple[Frame, ...]) -> Conclusion:
+        """Return the result, "after" measured on the verification's frames only."""
+        ...

@@ -1,0 +1,306 @@
+"""The closed loop: shows, grabs, gates, journals, checkpoints, judges, verifies, stops. It knows no physics.
+
+Whatever happens, the panel is blanked and the light switched off before `run` returns or raises.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+import traceback
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from holocal.errors import HolocalError, Interrupted
+from holocal.loop.devices import Frame, Repeatable, Rig
+from holocal.loop.gates import Verdict
+from holocal.loop.preflight import Check, preflight, refuse_failed
+from holocal.loop.procedure import Conclusion, Judgement, Outcome, Plan, Procedure, Shot
+from holocal.loop.record import RunRecord
+from holocal.loop.shooting import Shooter
+from holocal.loop.signals import StopRequest, stop_requests
+from holocal.records.facts import RigFacts
+from holocal.records.files import json_ready
+
+SCHEMA = 1
+LOGGER = logging.getLogger("holocal.loop")
+RESUMABLE = (6, 130)  # exit statuses after which `resume` goes on
+PREFLIGHT_STEP = -1
+
+
+class Observer(Protocol):
+    """Who watches a run: the terminal, a page, a test. Nothing it does changes the run."""
+
+    def preflight(self, checks: list[Check], seconds: float) -> None:
+        """Be told the pre-flight's checks."""
+        ...
+
+    def waiting(self, what: str) -> None:
+        """Be told what the run waits for."""
+        ...
+
+    def incident(self, sentence: str) -> None:
+        """Be told of a bad frame or a halved exposure."""
+        ...
+
+    def step(self, number: int, progress: Mapping[str, Any], judgement: Judgement) -> None:
+        """Be told a step's number of the goal and what was decided."""
+        ...
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """How a run ended: the JSON of the contract, its sentence, and the exit status (0 targets met, 3 not)."""
+
+    result: dict[str, Any]
+    sentence: str
+    directory: Path
+
+    @property
+    def exit_status(self) -> int:
+        """Return 0 when every target holds, 3 otherwise."""
+        return 0 if self.result["targets_met"] else 3
+
+
+def run(
+    procedure: Procedure[Any],
+    rig: Rig,
+    parameters: Any,
+    *,
+    seed: int,
+    record: RunRecord,
+    calibration: Mapping[str, Any],
+    observer: Observer,
+    render: Callable[[Path], bytes] | None = None,
+) -> RunResult:
+    """Return the result of one closed loop on an opened rig; goes on where `record` has a checkpoint.
+
+    Parameters
+    ----------
+    procedure, parameters
+        What is measured, and its checked parameters.
+    seed
+        All randomness comes from it and the number of the step.
+    record
+        The run's directory, held open by the caller.
+    calibration
+        Procedure -> `holocal.records.calibration.Accepted`: the corrections in force.
+    observer
+        Who is told how it goes.
+    render
+        Makes the report's bytes from the run's directory; the report and the manifest are written on every end.
+
+    Raises
+    ------
+    HolocalError
+        Refused, safety stop, device lost, interrupted, disk full; the record says so too.
+    """
+    with stop_requests() as stop:
+        try:
+            with dark_at_the_end(rig):
+                done = _Loop(procedure, rig, parameters, seed, record, calibration, observer, stop).run()
+        except (Exception, KeyboardInterrupt) as error:  # every end is written down, then raised
+            written = _close_failed(record, error, render)
+            if written is error:
+                raise
+            raise written from error
+        observer.waiting("the report")
+        record.finish("complete", render=render)
+        return done
+
+
+@contextmanager
+def dark_at_the_end(rig: Rig) -> Iterator[None]:
+    """Blank the panel and switch the light off on every way out, each though the other may fail."""
+    with ExitStack() as stack:
+        stack.callback(rig.slm.blank)
+        stack.callback(rig.light.off)  # called first
+        yield
+
+
+def _close_failed(record: RunRecord, error: BaseException, render: Callable[[Path], bytes] | None) -> BaseException:
+    """Return the error to raise, after writing it to the journal, the log, the report and the manifest."""
+    if isinstance(error, KeyboardInterrupt):
+        error = _interrupted("SIGINT twice", record)
+    if isinstance(error, HolocalError):
+        said = error.as_json()
+        LOGGER.error("%s", error)
+    else:
+        said = {"code": "bug", "what": f"{type(error).__name__}: {error}", "exit_status": 1}
+        LOGGER.error("bug\n%s", "".join(traceback.format_exception(error)))
+    resumable = said["exit_status"] in RESUMABLE
+    try:
+        record.journal("error", **{key: value for key, value in said.items() if value not in ("", None)})
+        record.finish("interrupted" if resumable else "failed", render=render, error=said)
+    except HolocalError as second:  # a full disk ends the record, and must not hide the first error
+        LOGGER.error("the record could not be closed: %s", second)
+    return error
+
+
+def _interrupted(signal_name: str, record: RunRecord) -> Interrupted:
+    return Interrupted(
+        f"stopped by {signal_name}; every finished step is kept.",
+        fix=f"Go on with `holocal resume {record.directory}`.",
+        code="interrupted",
+    )
+
+
+class _Loop:
+    """One run from its first frame, or its checkpoint, to its conclusion."""
+
+    def __init__(
+        self,
+        procedure: Procedure[Any],
+        rig: Rig,
+        parameters: Any,
+        seed: int,
+        record: RunRecord,
+        calibration: Mapping[str, Any],
+        observer: Observer,
+        stop: StopRequest,
+    ) -> None:
+        self.procedure, self.rig, self.parameters, self.seed = procedure, rig, parameters, seed
+        self.record, self.calibration, self.observer, self.stop = record, calibration, observer, stop
+        self.facts: RigFacts = rig.facts()
+        self.plan: Plan = procedure.plan(self.facts, parameters)
+        self.shooter = Shooter(rig, self.facts, self._incident)
+        self.step = 0
+        self.preflight_frames = 0
+        self.shots: list[dict[str, Any]] = []
+        self.seconds_before = 0.0
+        self.started = time.monotonic()
+
+    def run(self) -> RunResult:
+        found = self.record.resume()
+        self._preflight()
+        if found is None:
+            self.observer.waiting("the first pattern")
+            state = self.procedure.start(self.facts, self.calibration, self.parameters, self.seed)
+            self.record.checkpoint(state, step=0, frames=0, seconds=self.seconds())
+            judgement = Judgement(Outcome.CONTINUE, "")
+        else:
+            state, progress = found
+            self.step, self.shooter.frames, self.seconds_before = progress.step, progress.frames, progress.seconds
+            LOGGER.info("resumed at step %d", self.step)
+            first = self.step == 0
+            judgement = Judgement(Outcome.CONTINUE, "") if first else self.procedure.judge(state)
+        while judgement.outcome is Outcome.CONTINUE:
+            self._stop_if_asked()
+            state, judgement = self._one_step(state)
+        return self._verify(state, judgement)
+
+    def seconds(self) -> float:
+        """Return the time used by this run, earlier sittings included."""
+        return self.seconds_before + time.monotonic() - self.started
+
+    def _preflight(self) -> None:
+        self.observer.waiting("the pre-flight")
+        self._begin(PREFLIGHT_STEP)
+        began = time.monotonic()
+        checks = preflight(self.shooter, self.facts, self.plan, self.record.directory)
+        self.preflight_frames, self.shooter.frames = self.shooter.frames, 0
+        self.record.preflight([item.as_json() for item in checks], frames=self.preflight_frames)
+        self.observer.preflight(checks, time.monotonic() - began)
+        refuse_failed(checks)
+
+    def _one_step(self, state: Any) -> tuple[Any, Judgement]:
+        self.observer.waiting(f"step {self.step + 1}")
+        frames = self._frames(self.procedure.stimuli(state))
+        state = self.procedure.update(state, frames)
+        self.step += 1
+        progress = json_ready(self.procedure.progress(state))
+        judgement = self.procedure.judge(state)
+        self.record.journal(
+            "step",
+            step=self.step,
+            progress=progress,
+            outcome=judgement.outcome.value,
+            sentence=judgement.sentence,
+            shots=self.shots,
+            frames=self.shooter.frames,
+        )
+        self.record.checkpoint(state, step=self.step, frames=self.shooter.frames, seconds=self.seconds())
+        LOGGER.info("step %d: %s %s", self.step, progress, judgement.sentence)
+        self.observer.step(self.step, progress, judgement)
+        return state, judgement
+
+    def _verify(self, state: Any, judgement: Judgement) -> RunResult:
+        self._stop_if_asked()
+        self.observer.waiting("the verification")
+        frames = self._frames(self.procedure.verification(state))
+        self.observer.waiting("the result")
+        conclusion = self.procedure.conclude(state, frames)
+        result = self._result(conclusion, judgement)
+        self.record.journal("verified", sentence=conclusion.sentence, after=conclusion.after, shots=self.shots)
+        self.record.conclusion(conclusion, result)
+        LOGGER.info("%s", conclusion.sentence)
+        return RunResult(result, conclusion.sentence, self.record.directory)
+
+    def _frames(self, shots: Iterator[Shot]) -> tuple[Frame, ...]:
+        """Return a step's frames; a shot is computed only when the one before was taken."""
+        self._begin(self.step)
+        self.shots = []
+        frames: list[Frame] = []
+        for shot in shots:
+            self.observer.waiting(shot.label)
+            frame = self.shooter.shoot(shot)
+            name = None
+            if shot.keep:
+                name = self.record.keep_frame(f"{self.step:02d}-{len(frames):02d}-{shot.label}", frame.counts)
+            self.shots.append(
+                {
+                    "label": shot.label,
+                    "exposure_s": frame.exposure_s,
+                    "saturated_fraction": frame.saturated_fraction,
+                    "mean_counts": float(np.mean(frame.counts)),
+                    **({"file": name} if name else {}),
+                }
+            )
+            frames.append(frame)
+        return tuple(frames)
+
+    def _begin(self, step: int) -> None:
+        self.shooter.begin_step()
+        if isinstance(self.rig, Repeatable):
+            self.rig.begin_step(self.seed, step)
+
+    def _stop_if_asked(self) -> None:
+        if self.stop:
+            raise _interrupted(str(self.stop.name), self.record)
+
+    def _incident(self, verdict: Verdict, shot: Shot, frame: Frame) -> None:
+        name = self.record.keep_bad_frame(f"bad-{self.step:02d}-{shot.label}-{frame.frame_id}", frame.counts)
+        said = {key: value for key, value in asdict(verdict).items() if key != "ok"}
+        self.record.journal("incident", step=self.step, shot=shot.label, **said, file=name)
+        LOGGER.warning("%s: %s", shot.label, verdict.sentence)
+        self.observer.incident(f"{shot.label}: {verdict.sentence}")
+
+    def _result(self, conclusion: Conclusion, judgement: Judgement) -> dict[str, Any]:
+        extra = dict(conclusion.extra)
+        truth = self.rig.truth()
+        if truth is not None:
+            extra["truth"] = {**truth, **extra.get("truth", {})}
+        result = {
+            "schema": SCHEMA,
+            "procedure": self.procedure.name,
+            "rig": self.facts.name,
+            "run": str(self.record.directory),
+            "targets_met": bool(conclusion.targets_met),
+            "outcome": judgement.outcome.value,
+            "sentence": conclusion.sentence,
+            "frames": self.shooter.frames,
+            "preflight_frames": self.preflight_frames,
+            "steps": self.step,
+            "seconds": round(self.seconds(), 3),
+            "seed": self.seed,
+            "before": conclusion.before,
+            "after": conclusion.after,
+            "targets": conclusion.targets,
+            "corrections": {name: found.entry for name, found in self.calibration.items()},
+        }
+        return dict(json_ready({**result, **extra}))

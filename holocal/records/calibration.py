@@ -1,0 +1,251 @@
+"""The calibration of a rig: which accepted run of each procedure is in force, and the way back.
+
+One directory per rig under ``HOLOCAL_HOME`` (default: the user's data directory)::
+
+    <home>/rigs/<rig>/entries/<run>/     identity.json, result.json, maps.exr: copied from the run, never changed
+    <home>/rigs/<rig>/states/0003.json   procedure -> entry, and the state before
+    <home>/rigs/<rig>/current.json       which state is in force; swapped by one rename
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from holocal.errors import InputError, RefusedError
+from holocal.records.files import make_directory, read_json, storage_error, sync, write_json
+from holocal.records.manifest import problems, read_manifest
+from holocal.records.maps import Maps, read_maps
+from holocal.records.rig import digest
+
+SCHEMA = 1
+ENTRY_FILES = ("identity.json", "result.json", "maps.exr")
+
+
+@dataclass(frozen=True)
+class Accepted:
+    """One accepted run: its result, its maps, and when it was accepted."""
+
+    procedure: str
+    entry: str
+    accepted_utc: str
+    result: Mapping[str, Any]
+    maps: Maps
+
+
+def home() -> Path:
+    """Return ``HOLOCAL_HOME``, or ``holocal`` in the user's data directory of this platform."""
+    if chosen := os.environ.get("HOLOCAL_HOME"):
+        return Path(chosen).expanduser()
+    if sys.platform == "win32":
+        return Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local") / "holocal"
+    if sys.platform == "darwin":
+        return Path.home() / "Library" / "Application Support" / "holocal"
+    return Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share") / "holocal"
+
+
+def rig_directory(rig: str) -> Path:
+    """Return the directory of a rig's calibration and lock; it need not exist."""
+    safe = "".join(letter if letter.isalnum() or letter in "-_" else "_" for letter in rig)
+    return home() / "rigs" / (safe if safe == rig else f"{safe}-{digest(rig)[:8]}")
+
+
+def in_force(rig: str) -> dict[str, str]:
+    """Return procedure -> entry of what is in force for a rig; empty when nothing is."""
+    return dict(_state(rig_directory(rig)).get("accepted", {}))
+
+
+def load(identity: Mapping[str, Any]) -> dict[str, Accepted]:
+    """Return the accepted run per procedure of the rig with this identity.
+
+    Raises
+    ------
+    RefusedError
+        The calibration in force was measured on a rig that differs; names the field and both values.
+    """
+    directory = rig_directory(str(identity["rig"]))
+    state = _state(directory)
+    loaded = {}
+    for procedure, entry in state.get("accepted", {}).items():
+        folder = directory / "entries" / entry
+        check_identity(
+            read_json(folder / "identity.json"),
+            identity,
+            subject=f"the accepted {procedure} calibration ({entry})",
+            fix=f"Work without it (`--corrections none`), or measure again: `holocal run {procedure} "
+            f"--rig {identity['rig']} --corrections none`, then `holocal accept`.",
+        )
+        loaded[procedure] = Accepted(
+            procedure,
+            entry,
+            str(state.get("accepted_utc", "")),
+            read_json(folder / "result.json"),
+            read_maps(folder / "maps.exr"),
+        )
+    return loaded
+
+
+def read_run(run: Path) -> Accepted:
+    """Return a finished run as if it were accepted (``--corrections RUN``), after checking its files."""
+    _check_complete(run)
+    result = read_json(run / "result.json")
+    return Accepted(str(result["procedure"]), run.name, "", result, read_maps(run / "maps.exr"))
+
+
+def check_identity(measured_on: Mapping[str, Any], rig: Mapping[str, Any], *, subject: str, fix: str) -> None:
+    """Raise `RefusedError`, naming the first field that differs and both values, unless two identities are the same."""
+    if measured_on.get("simulated") and not rig.get("simulated"):
+        raise RefusedError(
+            f"{subject} was measured on a simulated rig; {rig.get('rig')} is real (simulated: True, False).",
+            why="A simulation says nothing about this bench.",
+            fix="Run the procedure on this rig.",
+            measured=True,
+            limit=False,
+            code="other-rig",
+        )
+    for key in sorted({*measured_on, *rig}, key=lambda name: (name != "rig", name)):
+        if measured_on.get(key) != rig.get(key):
+            raise RefusedError(
+                f"{subject} was measured with {key} = {measured_on.get(key)!r}; this rig has {rig.get(key)!r}.",
+                why="It would correct another bench.",
+                fix=fix,
+                measured=measured_on.get(key),
+                limit=rig.get(key),
+                code="other-rig",
+            )
+
+
+def accept(run: Path, identity: Mapping[str, Any]) -> dict[str, Any]:
+    """Put a run's result in force for the rig with this identity, atomically, and return the new state.
+
+    Raises
+    ------
+    RefusedError
+        The run is not complete, missed its targets, is of another rig, or was measured under other corrections than
+        those that are in force now.
+    InputError
+        The run's files are not what its manifest says.
+    """
+    _check_complete(run)
+    result = read_json(run / "result.json")
+    procedure = str(result["procedure"])
+    if result.get("targets_met") is not True:
+        raise RefusedError(
+            f"{run.name} did not meet its targets: {result.get('sentence', 'see its report')}",
+            why="A calibration that missed its target is evidence, not a calibration.",
+            fix=f"Run it again: `holocal run {procedure} --rig {result.get('rig')}`.",
+            measured=result.get("after"),
+            limit=result.get("targets"),
+            code="targets-missed",
+        )
+    check_identity(
+        read_json(run / "identity.json"),
+        identity,
+        subject=f"run {run.name}",
+        fix=f"Measure this rig: `holocal run {procedure} --rig {identity['rig']}`.",
+    )
+    directory = rig_directory(str(identity["rig"]))
+    state = _state(directory)
+    accepted = {
+        name: entry
+        for name, entry in state.get("accepted", {}).items()
+        if read_json(directory / "entries" / entry / "identity.json") == dict(identity)
+    }
+    _check_corrections(run.name, procedure, result.get("corrections", {}), accepted)
+    _copy_entry(run, directory)
+    return _advance(directory, state, {**accepted, procedure: run.name})
+
+
+def rollback(rig: str) -> dict[str, Any]:
+    """Put the state before the last `accept` in force again, and return it; `RefusedError` when there is none."""
+    directory = rig_directory(rig)
+    state = _state(directory)
+    if not state:
+        raise RefusedError(f"rig {rig} has no accepted calibration in {directory}.", fix="There is nothing to undo.")
+    write_json(directory / "current.json", {"schema": SCHEMA, "state": state["before"]})
+    return _state(directory)
+
+
+def _check_complete(run: Path) -> None:
+    if not run.is_dir():
+        raise InputError(f"{run} is not a run directory.", fix="Give the path of a run, or use `--runs DIR`.")
+    manifest = read_manifest(run)
+    if manifest["status"] != "complete":
+        raise RefusedError(
+            f"{run.name} is not complete: its status is {manifest['status']!r}.",
+            fix=f"Finish it: `holocal resume {run}`.",
+            measured=manifest["status"],
+            limit="complete",
+            code="not-complete",
+        )
+    if found := problems(run):
+        raise InputError(
+            f"{run.name} is not what was measured: {' '.join(found)}",
+            fix="Measure again, or restore the files from a copy.",
+            measured=len(found),
+            limit=0,
+            code="damaged-run",
+        )
+
+
+def _check_corrections(
+    run: str, procedure: str, measured_under: Mapping[str, str], accepted: Mapping[str, str]
+) -> None:
+    for name in sorted({*measured_under, *accepted} - {procedure}):
+        if measured_under.get(name) != accepted.get(name):
+            raise RefusedError(
+                f"{run} was measured under {name} = {measured_under.get(name) or 'none'}; "
+                f"in force is {accepted.get(name) or 'none'}.",
+                why="Corrections are measured on top of each other.",
+                fix=f"Measure again under what is in force: `holocal run {procedure}`.",
+                measured=measured_under.get(name),
+                limit=accepted.get(name),
+                code="other-corrections",
+            )
+
+
+def _state(directory: Path) -> dict[str, Any]:
+    pointer = directory / "current.json"
+    if not pointer.is_file():
+        return {}
+    name = read_json(pointer)["state"]
+    return read_json(directory / "states" / f"{name}.json") if name else {}
+
+
+def _copy_entry(run: Path, directory: Path) -> None:
+    entry = make_directory(directory / "entries") / run.name
+    if entry.is_dir():
+        return
+    partial = entry.with_name(f".{run.name}.{os.getpid()}.tmp")
+    try:
+        partial.mkdir()
+        for name in ENTRY_FILES:
+            shutil.copyfile(run / name, partial / name)
+            sync(partial / name)
+        partial.rename(entry)
+        sync(entry.parent)
+    except OSError as error:
+        raise storage_error(error, entry) from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def _advance(directory: Path, before: Mapping[str, Any], accepted: Mapping[str, str]) -> dict[str, Any]:
+    states = make_directory(directory / "states")
+    number = 1 + max((int(path.stem) for path in states.glob("[0-9]*.json")), default=0)
+    state = {
+        "schema": SCHEMA,
+        "state": f"{number:04d}",
+        "before": before.get("state"),
+        "accepted": dict(accepted),
+        "accepted_utc": datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
+    }
+    write_json(states / f"{number:04d}.json", state)
+    write_json(directory / "current.json", {"schema": SCHEMA, "state": state["state"]})
+    return state
