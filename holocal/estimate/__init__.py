@@ -1,1 +1,10 @@
-"""."""
+"""From frames to what they say, with how sure: no hardware, no files, no plots.
+
+==============  =========================================================================
+blocks          local mean brightness of a speckled picture, and its noise
+thesis_map      the thesis's estimate of the brightness: block means, then a Gaussian
+registration    where the camera sees the image, from a frame of blobs
+brightness      the default: one smooth map from all frames, by a Gaussian process
+uniformity      non-uniformity of a picture, speckle taken out, with its error
+==============  =========================================================================
+"""

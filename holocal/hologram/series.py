@@ -40,6 +40,10 @@ class Series:
             total[: one.shape[0], : one.shape[1]] += one
         return Series(total, self.centre, self.half)
 
+    def times(self, factor: float) -> Series:
+        """Return the series times a number."""
+        return Series(self.coefficients * factor, self.centre, self.half)
+
     def __neg__(self) -> Series:
         return Series(-self.coefficients, self.centre, self.half)
 

@@ -109,21 +109,62 @@ def _zone_waves(
     """Return the zone's sums over its points, (scenes, rows, columns) complex64, by one type-1 transform."""
     rows, columns = part
     shift = zone.shift.on_grid(scenes[0].x_tan[columns], scenes[0].y_tan[rows])[bright]
+    if zone.warp is not None:
+        return _warped_waves(zone, grid, box, scenes, part, bright, shift)
     height, width = box.shape
     origin_x = grid.x_m[box.columns.start + width // 2]  # mode 0 of the transform
     origin_y = grid.y_m[box.rows.start + height // 2]
     turns = shift[:, 0] * (origin_x - zone.pivot_m[0]) + shift[:, 1] * (origin_y - zone.pivot_m[1]) + shift[:, 2]
-    turns -= np.round(turns)
-    strengths = np.empty((len(scenes), len(turns)), np.complex64)
-    for strength, scene in zip(strengths, scenes, strict=True):
-        phase = 2 * np.pi * turns + scene.phase_rad[rows, columns][bright]
-        strength[:] = scene.amplitude[rows, columns][bright] * np.exp(1j * phase)
+    strengths = _strengths(turns, scenes, part, bright)
     per_row = (-2 * np.pi * grid.step_y_m * shift[:, 1]).astype(np.float32)  # rows run downwards
     per_column = (2 * np.pi * grid.step_x_m * shift[:, 0]).astype(np.float32)
     waves = finufft.nufft2d1(
         per_row, per_column, strengths, (height, width), eps=_ACCURACY, isign=1, upsampfac=_OVERSAMPLING
     )
     return np.asarray(waves, np.complex64).reshape(len(scenes), height, width)
+
+
+def _strengths(
+    turns: NDArray[np.float64], scenes: Sequence[PointGrid], part: tuple[slice, slice], bright: NDArray[np.bool_]
+) -> Complex:
+    """Return the bright points' amplitudes with their phases, `turns` added, (scenes, points) complex64."""
+    rows, columns = part
+    turns = turns - np.round(turns)
+    strengths = np.empty((len(scenes), len(turns)), np.complex64)
+    for strength, scene in zip(strengths, scenes, strict=True):
+        phase = 2 * np.pi * turns + scene.phase_rad[rows, columns][bright]
+        strength[:] = scene.amplitude[rows, columns][bright] * np.exp(1j * phase)
+    return strengths
+
+
+def _warped_waves(
+    zone: Zone,
+    grid: Grid,
+    box: Box,
+    scenes: Sequence[PointGrid],
+    part: tuple[slice, slice],
+    bright: NDArray[np.bool_],
+    shift: NDArray[np.float64],
+) -> Complex:
+    """Return the zone's sums over its points in warped coordinates: a type-3 transform onto the footprint's samples."""
+    assert zone.warp is not None
+    x, y = grid.x_m[box.columns], grid.y_m[box.rows]
+    left, right = row_spans(zone.rim_m, y)
+    inside = (x > left[:, None] - grid.step_x_m) & (x < right[:, None] + grid.step_x_m)
+    warped = zone.warp.on_grid(x, y)[inside].astype(np.float32)
+    waves = np.zeros((len(scenes), *box.shape), np.complex64)
+    tilt = (2 * np.pi * shift[:, :2]).astype(np.float32)
+    waves[:, inside] = finufft.nufft2d3(
+        np.ascontiguousarray(tilt[:, 0]),
+        np.ascontiguousarray(tilt[:, 1]),
+        _strengths(shift[:, 2], scenes, part, bright),
+        np.ascontiguousarray(warped[:, 0]),
+        np.ascontiguousarray(warped[:, 1]),
+        eps=_ACCURACY,
+        isign=1,
+        upsampfac=_OVERSAMPLING,
+    )
+    return waves
 
 
 def _zone_factor(zone: Zone, grid: Grid, box: Box, device: str) -> torch.Tensor:

@@ -18,9 +18,11 @@ from holocal.hologram.footprint import sample_footprint
 from holocal.hologram.reference import PupilWindow, pupil_window, reference_turns
 from holocal.hologram.series import Series, fit_series
 from holocal.hologram.settings import HologramSettings
+from holocal.hologram.warp import fit_warp
 from holocal.optics.bench import Array
 from holocal.optics.phase_function import PhaseFunctions, VirtualPoints, phase_functions, pupil_rim, trace_points
 
+OUTLINE_MARGIN = 1.15  # of the pupil: a mirror turned by 0.3 degrees moves the footprints by a tenth of their width
 _CORNERS = 6  # grid lines of corners across the field when the zones themselves have fewer
 
 
@@ -43,6 +45,8 @@ class Zone:
         Outline (n, 2) of the footprints of its points together.
     band_per_m
         Largest |frequency| along (x, y) of the zone's light after division by the reference.
+    warp
+        Warped coordinates of the panel, metres, two values; None where they are x - `pivot_m`.
     """
 
     row: int
@@ -52,6 +56,7 @@ class Zone:
     pivot_m: Array
     rim_m: Array
     band_per_m: tuple[float, float]
+    warp: Series | None = None
 
 
 @dataclass(frozen=True)
@@ -168,6 +173,10 @@ def _zone(
     if not len(samples):
         return None
     pivot = area @ samples
+    if settings.warped:
+        form = fit_warp(settings, bounds, rim, pivot)
+        factor, shift = form.phase_rad.times(1 / (2 * np.pi)) + (-reference), form.field.times(1 / (2 * np.pi))
+        return Zone(row, column, factor, shift, pivot, rim, _band(factor, shift, samples), form.coordinate_m)
     own = table.traced[row * settings.zones + column]
     factor = fit_series(
         lambda slm_m: own.phase(slm_m) / (2 * np.pi), degree=3, centre=(0.0, 0.0), half=settings.panel.half_size_m
@@ -183,12 +192,13 @@ def _zone(
 def zone_outline(settings: HologramSettings, bounds: tuple[tuple[float, float], tuple[float, float]]) -> Array:
     """Return the outline (n, 2), anticlockwise, of what the footprints of all of a zone's points cover together.
 
-    Each point is lit over its whole footprint; what is lit beyond it misses the pupil. With the centre's footprint for
-    all points of a zone, brightness would jump at the zones' borders (thesis figure 4.10).
+    Each point is lit over its whole footprint, and a margin for the bench's misalignment; what is lit beyond it misses
+    the pupil. With the centre's footprint for all points of a zone, or none of the margin on a misaligned bench,
+    brightness jumps at the zones' borders (thesis figure 4.10).
     """
     corners = np.array([[x, y] for x in bounds[0] for y in bounds[1]])
     points = VirtualPoints.at(corners[:, None], settings.depth_m)
-    rim = pupil_rim(settings.bench.pupil_diameter_m)
+    rim = pupil_rim(settings.bench.pupil_diameter_m * OUTLINE_MARGIN)
     landing = trace_points(settings.bench, points, rim, settings.gaze_rad).landing_m.reshape(-1, 2)
     return np.asarray(landing[ConvexHull(landing).vertices])
 

@@ -18,11 +18,13 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from holocal.optics.bench import Array, Bench, Panel
+from holocal.optics.raytrace import trace_to_pupil
 from rigs.simulated.kernel import Box, PatchKernel, PathTable, Polynomial, fit_patch, interpolate
 
 Complex = NDArray[np.complex64]
@@ -183,7 +185,7 @@ class PanelToPupil:
         ]
         plan = self._plan_patch
         self._patches = list(self._pool.map(lambda job: plan(job[0], job[1], job[2], job[3], illumination), jobs))
-        self._unmodulated = self._dead_space([job[0] for job in jobs])
+        self._unmodulated = self._dead_space(bench, [job[0] for job in jobs])
 
     def _box(self, rows: slice, columns: slice) -> Box:
         x, y, half = self.panel.x_m[columns], self.panel.y_m[rows], self.panel.pitch_m / 2
@@ -244,7 +246,8 @@ class PanelToPupil:
         ]
         self._to_columns = _matrices(self._filters[0], [_along(middle - common, fine_x, axis=1) for middle in middles])
         self._rests = [
-            torch.from_numpy(unit_phase(_rest(middle - common, self._coarse[0], fine_y, axis=1))) for middle in middles
+            np.ascontiguousarray(unit_phase(_rest(middle - common, self._coarse[0], fine_y, axis=1)).T)
+            for middle in middles
         ]
         tilt = k * (self.grid.carrier[0] * fine_x[None] + self.grid.carrier[1] * fine_y[:, None])
         common_phase = unit_phase((common.on_grid(fine_x, fine_y) + tilt).T)
@@ -294,9 +297,13 @@ class PanelToPupil:
             amplitude *= np.sinc(pitch * fx) * np.sinc(pitch * fy) - active if dead else active
         return interpolate(pupil, amplitude)
 
-    def _dead_space(self, kernels: list[PatchKernel]) -> torch.Tensor | None:
-        """Return the field in the pupil of the light that the frames between the pixels send, unmodulated."""
-        if self.fill_factor is None or self.fill_factor == 1:
+    def _dead_space(self, bench: Bench, kernels: list[PatchKernel]) -> torch.Tensor | None:
+        """Return the field in the pupil of the light that the frames between the pixels send, unmodulated.
+
+        It comes to a focus, a millimetre wide at most, at the diffraction orders of the pixels: where all of these lie
+        outside of the pupil by more than that, there is none (what strays in is below 1e-4 of the signal).
+        """
+        if self.fill_factor is None or self.fill_factor == 1 or not self._order_in_reach(bench):
             return None
 
         def piece(job: tuple[_Patch, PatchKernel]) -> Complex:
@@ -304,6 +311,14 @@ class PanelToPupil:
             return self._piece(job[0], None, (dead[self._needed] / active[self._needed]).astype(np.float32))
 
         return self._sum(list(self._pool.map(piece, zip(self._patches, kernels, strict=True))))
+
+    def _order_in_reach(self, bench: Bench) -> bool:
+        """Return whether a diffraction order of the panel's middle lands within a millimetre of the pupil."""
+        order = np.stack(np.meshgrid([-1, 0, 1], [-2, -1, 0, 1]), axis=-1).reshape(-1, 2) / self.panel.pitch_m
+        sines = self.wavelength_m * (order + np.array(self.panel.illumination_frequency_per_m))
+        along = np.sqrt(np.maximum(1 - np.sum(sines**2, axis=1, keepdims=True), 0))
+        rays = trace_to_pupil(bench, np.zeros((len(sines), 2)), np.concatenate([sines, along], axis=1))
+        return bool(np.any(rays.valid & (np.linalg.norm(rays.landing_m, axis=1) < self.radius_m + 1e-3)))
 
     def field(self, modulation: Complex) -> Complex:
         """Return the field inside the pupil, (columns, rows) complex64 on `grid`, of a (height, width) modulation.
@@ -317,12 +332,17 @@ class PanelToPupil:
         return np.asarray(field.numpy())
 
     def _sum(self, pieces: list[Complex]) -> torch.Tensor:
+        rows, columns = len(self.grid.y_m), len(self.grid.x_m)
         lines, n = [], len(pieces) // len(self._rests)
+        fine = None
         for i, (matrices, rest) in enumerate(zip(self._to_rows, self._rests, strict=True)):
             column = [torch.from_numpy(piece) for piece in pieces[i * n : (i + 1) * n]]
-            fine = _combine(column, matrices)[: len(self.grid.y_m)]
-            lines.append(torch.mul(fine.T, rest.T).contiguous())
-        return _combine(lines, self._to_columns)[: len(self.grid.x_m)].mul_(self._common)
+            fine = _combine(column, matrices, out=fine)
+            pairs = fine.flatten(0, 1)[:rows].numpy().view(np.float32).reshape(rows, -1, 2)
+            turned = cv2.transpose(pairs).view(np.complex64)[..., 0]  # four times as fast as a strided copy
+            turned *= rest
+            lines.append(torch.from_numpy(turned))
+        return _combine(lines, self._to_columns).flatten(0, 1)[:columns].mul_(self._common)
 
     def _piece(self, patch: _Patch, modulation: Complex | None, factor: NDArray[np.float32] | None = None) -> Complex:
         source = patch.phase if modulation is None else modulation[patch.rows, patch.columns] * patch.phase
@@ -332,14 +352,17 @@ class PanelToPupil:
         return piece
 
 
-def _combine(pieces: list[torch.Tensor], matrices: list[torch.Tensor]) -> torch.Tensor:
-    """Return the sum of the pieces, (blocks * ratio, m), each (blocks + TAPS - 1, m) brought to the fine grid."""
-    total = None
-    for piece, matrix in zip(pieces, matrices, strict=True):
+def _combine(
+    pieces: list[torch.Tensor], matrices: list[torch.Tensor], *, out: torch.Tensor | None = None
+) -> torch.Tensor:
+    """Return the sum of the pieces, (blocks, ratio, m), each (blocks + TAPS - 1, m) brought to the fine grid."""
+    for i, (piece, matrix) in enumerate(zip(pieces, matrices, strict=True)):
         windows = piece.unfold(0, TAPS, 1).transpose(1, 2)  # (blocks, taps, m), a view
-        total = torch.bmm(matrix, windows) if total is None else total.baddbmm_(matrix, windows)
-    assert total is not None
-    return total.flatten(0, 1)
+        if out is None:
+            out = torch.empty((*matrix.shape[:2], piece.shape[1]), dtype=torch.complex64)
+        torch.baddbmm(out, matrix, windows, beta=1 if i else 0, out=out)
+    assert out is not None
+    return out
 
 
 def _matrices(taps: NDArray[np.float32], carriers_rad: list[Array]) -> list[torch.Tensor]:

@@ -83,6 +83,7 @@ class PupilToPicture:
             (len(grid.x_m), len(grid.y_m)),
             eps=NUFFT_EPS,
             isign=1,
+            upsampfac=1.25,  # half the memory of 2, and no slower
             dtype="complex64",
             nthreads=torch.get_num_threads(),
         )
