@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from holocal.estimate.thesis_map import at_size, thesis_map
 from holocal.estimate.uniformity import Uniformity, inscribed_rectangle, measure_uniformity
 from holocal.loop.procedure import Conclusion, Figure
-
 from procedures._uniformity_geometry import as_seen
 
 if TYPE_CHECKING:
@@ -34,8 +33,8 @@ def thesis_weights(state: State, shown: NDArray[np.float64], valid: NDArray[np.b
 def beside_thesis(state: State, verified: Image, block_px: int) -> dict[str, float]:
     """Return what the thesis's estimator, given the same white frames, would have left.
 
-    Its map is made from the mean of the white frames (`thesis_mean`) and from the first alone (`thesis_single`, as in the
-    thesis). The picture that its weights would give is the verification's, times the ratio of its weights to those
+    Its map is made from the mean of the white frames (`thesis_mean`) and from the first alone (`thesis_single`, as in
+    the thesis). The picture that its weights would give is the verification's, times the ratio of its weights to those
     shown, to the power of the fitted response.
     """
     assert state.valid is not None
@@ -48,10 +47,14 @@ def beside_thesis(state: State, verified: Image, block_px: int) -> dict[str, flo
         seen = at_size(thesis_map(frame), *valid.shape)
         ratio = (1 / np.maximum(seen, 1e-6 * seen.max()) / corrected) ** state.gamma
         ratio /= ratio[valid].mean()
-        found = measure_uniformity(verified * np.where(valid, ratio, 0.0), valid, block_px=block_px)
+        found = _measured(verified * np.where(valid, ratio, 0.0), valid, block_px=block_px)
         out[f"{name}_nonuniformity_rms"] = found.rms
         out[f"{name}_nonuniformity_9pt"] = found.nine_point
     return out
+
+
+def _measured(pictures: Image, valid: NDArray[np.bool_], *, block_px: int) -> Uniformity:
+    return measure_uniformity(np.asarray(pictures, np.float64), valid, block_px=block_px)
 
 
 def _numbers(found: Uniformity, light: float) -> dict[str, float]:
@@ -66,8 +69,8 @@ def conclusion(state: State, verified: Image) -> Conclusion:
     assert state.registration is not None
     chosen, valid = state.parameters, state.valid
     white = state.frames[[shown == 0 for shown in state.shown]]
-    before = measure_uniformity(white, valid, block_px=chosen.block_px)
-    after = measure_uniformity(verified, valid, block_px=chosen.block_px)
+    before = _measured(white, valid, block_px=chosen.block_px)
+    after = _measured(verified, valid, block_px=chosen.block_px)
     light = after.mean / before.mean
     met = after.rms <= chosen.target_rms and after.nine_point <= chosen.target_9pt
     correctable = float(valid.mean())
@@ -118,15 +121,17 @@ def conclusion(state: State, verified: Image) -> Conclusion:
     )
 
 
-def _figures(state: State, before: Image, after: Image, extent: tuple[float, float, float, float]) -> tuple[Figure, ...]:
+def _figures(
+    state: State, before: Image, after: Image, extent: tuple[float, float, float, float]
+) -> tuple[Figure, ...]:
     """Return the report's pictures: before and after on one scale, their cross-sections, the map, its error."""
     assert state.valid is not None
     assert state.brightness is not None
     assert state.sigma is not None
     valid = state.valid
     scale = np.float32(1 / before[valid].mean())
-    top, bottom, left, right = inscribed_rectangle(valid)
-    row, column = (top + bottom) // 2, (left + right) // 2
+    top, bottom, *_ = inscribed_rectangle(valid)
+    row = (top + bottom) // 2
     reach = state.parameters.block_px // 2
     x = np.linspace(extent[0], extent[1], valid.shape[1])
     band = slice(max(row - reach, 0), row + reach + 1)
@@ -136,7 +141,7 @@ def _figures(state: State, before: Image, after: Image, extent: tuple[float, flo
         line = (picture[band] * scale).mean(axis=0)
         cuts[name] = np.where(valid[row], np.convolve(line, kernel, mode="same"), np.nan)
     mask = valid.astype(np.float32)
-    title = f"Brightness along the row through the middle, {2 * reach + 1} rows and columns averaged"
+    title = f"Brightness along the row through the middle ({2 * reach + 1} rows and columns averaged)"
     return (
         Figure(
             "field",
@@ -144,7 +149,7 @@ def _figures(state: State, before: Image, after: Image, extent: tuple[float, flo
             "pair",
             {"before": before * scale, "after": after * scale, "valid": mask},
             "of the mean before",
-            "Mean of the frames; the grain is speckle. Beyond the hatched border the field is too faint to be corrected.",
+            "Mean of the frames; the grain is speckle. Beyond the border the field is too faint to be corrected.",
             extent,
         ),
         Figure("cut", title, "curve", cuts, "of the mean before", "x: field angle in degrees", extent),

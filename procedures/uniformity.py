@@ -16,17 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from holocal.errors import SafetyStop
 from holocal.estimate.registration import Registration, blob_image, register
 from holocal.loop.devices import Frame
 from holocal.loop.procedure import Conclusion, Judgement, Outcome, Plan, Shot
 from holocal.records.facts import RigFacts
+from procedures._uniformity_exposure import with_exposure
 from procedures._uniformity_geometry import as_seen, in_image
 
 Array = NDArray[np.float64]
 
-EXPOSURE_SHOTS = 6  # at most, to find the exposure
-NOISE_TERMS = 9.0  # full scale lies this many speckle contrasts above the brightest mean: 3e-5 of the pixels clip there
 VERIFICATION = 1000  # the step number that seeds the verification's initial phases
 
 
@@ -45,8 +43,7 @@ class Parameters(BaseModel):
     verify_frames: int = Field(default=3, ge=2, le=100)
     max_steps: int = Field(default=2, ge=1, le=20)
     wavelength_nm: float = Field(default=515.0, gt=0.0)
-    zones: int = Field(default=1, ge=1, le=64)
-    warped: bool = True
+    zones: int | None = Field(default=None, ge=1, le=64)  # None: warped patches; else the thesis's zones
     iterations: int = Field(default=10, ge=0, le=1000)
     device: str = "cpu"
 
@@ -58,7 +55,8 @@ class State:
     `frames` (n, height, width) are brightness per second of exposure, dark subtracted; `shown` (n,) says with which of
     `weights` (steps, height, width; of the image) each was shown; `dark` is the dark frame in counts, `first` a white
     frame of the exposure's search that is good enough to be used. `exposure_s` 0 means that it is still being looked
-    for, from `guess_s`. `registration` maps the image to the picture; `valid`, `brightness`, `sigma` are of the picture.
+    for, from `guess_s`. `registration` maps the image to the picture; `valid`, `brightness`, `sigma` belong to the
+    picture.
     """
 
     facts: RigFacts
@@ -95,8 +93,8 @@ def frame_levels(weights: NDArray[np.floating[Any]], state: State, step: int, sh
         bench=Bench.nominal(pupil_diameter_m=facts.pupil_diameter_m, eye_relief_m=facts.eye_relief_m),
         wavelength_m=chosen.wavelength_nm * 1e-9,
         fov_rad=facts.camera.field_rad,
-        zones=chosen.zones,
-        warped=chosen.warped,
+        zones=chosen.zones or 5,
+        warped=chosen.zones is None,
         iterations=chosen.iterations,
         device=chosen.device,
     )
@@ -128,9 +126,7 @@ class Uniformity:
             ),
         )
 
-    def start(
-        self, facts: RigFacts, calibration: Mapping[str, Any], parameters: Parameters, seed: int
-    ) -> State:
+    def start(self, facts: RigFacts, calibration: Mapping[str, Any], parameters: Parameters, seed: int) -> State:
         """Return the first state: nothing is known; the weights are 1."""
         height, width = facts.camera.height, facts.camera.width
         return State(
@@ -150,7 +146,7 @@ class Uniformity:
             residual=(),
             residual_sigma=(),
             map_sigma=float("nan"),
-            gamma=1.0,
+            gamma=0.95,
             gamma_sigma=float("nan"),
             valid=None,
             brightness=None,
@@ -180,7 +176,7 @@ class Uniformity:
         """Return the state with the exposure found, or with these frames in the estimate and the weights made anew."""
         state = replace(state, step=state.step + 1)
         if state.exposure_s == 0:
-            return _with_exposure(state, frames[0])
+            return with_exposure(state, frames[0])
         taken: list[NDArray[np.float32]] = []
         if state.dark is None:
             dark, blobs, frames = frames[0].counts.astype(np.float32), frames[1], frames[2:]
@@ -225,7 +221,9 @@ class Uniformity:
     def judge(self, state: State) -> Judgement:
         """Return whether another step pays."""
         if not state.residual:
-            return Judgement(Outcome.CONTINUE, "looking for the exposure" if state.exposure_s == 0 else "exposure found")
+            return Judgement(
+                Outcome.CONTINUE, "looking for the exposure" if state.exposure_s == 0 else "exposure found"
+            )
         target = state.parameters.target_rms
         now, done = state.residual[-1], len(state.residual) - 1  # steps with a correction
         said = f"non-uniformity {now:.4f}, target {target:g}"
@@ -280,50 +278,6 @@ def brightness_of(frame: Frame, dark: NDArray[np.float32]) -> NDArray[np.float32
     return np.asarray((frame.counts.astype(np.float32) - dark) / np.float32(frame.exposure_s))
 
 
-def _with_exposure(state: State, frame: Frame) -> State:
-    """Return the state with the exposure that suits the speckle's tail, or with the next guess.
-
-    Full scale at twice the mean would clip the speckle and bias the map by 7 %: the brightest block's mean is put at
-    full scale / (1 + 9 contrasts).
-    """
-    from holocal.estimate.blocks import block_means
-
-    camera = state.facts.camera
-    offset = float(np.quantile(frame.counts, 0.01))  # the corners of the field are dark
-    counts = frame.counts.astype(np.float64) - offset
-    block = state.parameters.block_px
-    brightest = float(np.quantile(block_means(counts, block).mean, 0.98))
-    clipped, faint = frame.saturated_fraction > 1e-3, brightest < 0.01 * camera.full_scale
-    if state.searched + 1 < EXPOSURE_SHOTS and (clipped or faint):
-        wanted = frame.exposure_s * (0.1 if clipped else min(30.0, 0.1 * camera.full_scale / max(brightest, 1.0)))
-        guess = float(np.clip(wanted, camera.exposure_min_s, camera.exposure_max_s))
-        if guess != frame.exposure_s:
-            return replace(state, guess_s=guess, searched=state.searched + 1)
-        if clipped:
-            raise SafetyStop(
-                f"{frame.saturated_fraction:.2%} of the pixels clip at the camera's shortest exposure, "
-                f"{1e3 * camera.exposure_min_s:g} ms.",
-                why="Clipped light is not measured, and may harm the sensor.",
-                fix="Put a neutral density filter in the beam or lower the laser's power by hand.",
-                measured=frame.saturated_fraction,
-                limit=1e-3,
-                code="too-bright",
-            )
-    lit = block_means(counts, block).mean > 0.5 * brightest
-    rows, columns = (np.linspace(0, n, m + 1).round().astype(int) for n, m in zip(counts.shape, lit.shape, strict=True))
-    contrasts = [
-        part.std() / part.mean()
-        for i, j in np.argwhere(lit)
-        if (part := counts[rows[i] : rows[i + 1], columns[j] : columns[j + 1]]).mean() > 0
-    ]
-    contrast = float(np.median(contrasts)) if contrasts else 1.0
-    wanted = frame.exposure_s * camera.full_scale / (1 + NOISE_TERMS * contrast) / max(brightest, 1.0)
-    if 0.2 * wanted <= frame.exposure_s <= 1.2 * wanted:  # speckle, not the sensor, is the noise: good enough to keep
-        first = frame.counts.astype(np.float32) / np.float32(frame.exposure_s)
-        return replace(state, exposure_s=frame.exposure_s, first=first)
-    return replace(state, exposure_s=float(np.clip(wanted, camera.exposure_min_s, camera.exposure_max_s)))
-
-
 def _estimated(state: State) -> State:
     """Return the state with the map of all frames, the residual of the last weights shown, and the next weights."""
     from holocal.estimate.blocks import block_means
@@ -336,9 +290,7 @@ def _estimated(state: State) -> State:
     assert state.registration is not None
     seen = np.stack([as_seen(weights, state.registration) for weights in state.weights])
     log_of_step = np.log(block_means(seen, chosen.block_px).mean)
-    found, _ = fit_brightness(
-        blocks, log_of_step[list(state.shown)], height=height, width=width, floor=chosen.floor
-    )
+    found, _ = fit_brightness(blocks, log_of_step[list(state.shown)], height=height, width=width, floor=chosen.floor)
     valid = found.valid if state.valid is None else state.valid  # the field is fixed by the first estimate
     found = replace(found, valid=valid)
     shown = found.brightness * seen[-1] ** found.gamma

@@ -35,7 +35,7 @@ class Request:
     depth_m: float
     wavelength_nm: float
     srgb: bool
-    zones: int
+    zones: int | None  # None: warped patches
     iterations: int
     seed: int
     corrections: str
@@ -98,7 +98,8 @@ def render(config: RigConfig, asked: Request, outputs: Outputs) -> dict[str, Any
         fov_rad=fov_rad,
         gaze_rad=gaze_rad,
         depth_m=asked.depth_m,
-        zones=asked.zones,
+        zones=asked.zones or 5,
+        warped=asked.zones is None,
         iterations=asked.iterations,
         device=config.device,
     )

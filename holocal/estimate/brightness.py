@@ -22,7 +22,8 @@ from skimage.measure import label
 from holocal.errors import InputError
 from holocal.estimate.blocks import Array, Blocks
 
-GAMMA_MEAN, GAMMA_SIGMA = 1.0, 0.2
+# The noise that phase-only encoding leaves in the pupil lifts the dark: 0.93 to 0.96 after 10 iterations of IFTA.
+GAMMA_MEAN, GAMMA_SIGMA = 0.95, 0.15
 GAIN_SIGMA = 3.0  # of log gain: wide
 LENGTHS = (0.15, 0.2, 0.3, 0.4, 0.6, 0.9)  # of the process, in half widths of the field
 HEIGHTS = (0.3, 1.0, 3.0)  # its standard deviation, in log brightness
@@ -113,14 +114,14 @@ def fit_brightness(
     best = int(np.argmax([fit.evidence for fit in fits]))
     fit, (length, size) = fits[best], candidates[best]
     log_map, sigma = _everywhere(fit, at, length, size, height, width)
-    valid = _correctable(log_map, floor, margin_px=(height // blocks.mean.shape[-2]) // 2)
+    valid = _correctable(log_map, floor, margin_px=height // blocks.mean.shape[-2])
     brightness = np.exp(log_map - log_map[valid].max())
     found = BrightnessMap(brightness, sigma, valid, fit.gamma, float(np.sqrt(fit.gamma_variance)), length)
     return found, used
 
 
 def weights_for(found: BrightnessMap, floor: float) -> Array:
-    """Return the intensity weights, (height, width) in (0, 1], that make the correctable field as bright as its faintest.
+    """Return intensity weights, (height, width) in (0, 1], that make the correctable field as bright as its faintest.
 
     Beyond it, and where the map is below the floor, the weight is 1: nothing is divided by a small number.
     """
@@ -214,8 +215,7 @@ def _resample(grid: NDArray[np.float32], size: tuple[int, int]) -> Array:
 def _correctable(log_map: Array, floor: float, *, margin_px: int) -> NDArray[np.bool_]:
     """Return where the brightness is at least `floor` of its largest, the largest connected region of it.
 
-    Less a margin: on a steep border a block is half bright and half dark, and neither map nor registration is good
-    enough to divide by.
+    Less a margin of one block: on a steep border neither map nor registration is good enough to divide by.
     """
     bright = log_map >= log_map.max() + np.log(floor)
     bright = distance_transform_edt(np.pad(bright, 1, mode="edge"))[1:-1, 1:-1] > margin_px

@@ -120,7 +120,9 @@ def _best_shift(picture: Array, pattern: Array) -> Array:
     Up to 30 % of the field: beyond, what is left of the pattern in the picture is too little to be sure.
     """
     shape = [next_fast_len(2 * n) for n in picture.shape]
-    correlation = irfft2(rfft2(picture - picture.mean(), shape) * np.conj(rfft2(pattern - pattern.mean(), shape)), shape)
+    correlation = irfft2(
+        rfft2(picture - picture.mean(), shape) * np.conj(rfft2(pattern - pattern.mean(), shape)), shape
+    )
     reach = [int(0.3 * n) for n in picture.shape]
     offsets = [np.r_[0 : r + 1, -r:0] for r in reach]
     near = correlation[np.ix_(*offsets)]
@@ -129,7 +131,7 @@ def _best_shift(picture: Array, pattern: Array) -> Array:
 
 
 def _centroids(picture: Array, near: Array, radius: float) -> tuple[Array, Array]:
-    """Return the centroids (n, 2) of discs around places, and the light in each, (n,); discs over the edge have none."""
+    """Return the centroids (n, 2) of discs around places, and the light in each, (n,); none for discs over the edge."""
     height, width = picture.shape
     reach = int(np.ceil(radius))
     found, light = near.copy(), np.zeros(len(near))

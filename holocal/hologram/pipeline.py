@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -121,18 +122,8 @@ def _frame(
 ) -> Rendered:
     """Encode one hologram that is divided by the reference and sampled on `grid`."""
     panel = settings.panel
-    reach_x, reach_y = plan.window.half_size_per_m
-    width_m, height_m = panel.width * panel.pitch_m, panel.height * panel.pitch_m
-    transform = WindowedTransform(
-        panel.height,
-        panel.width,
-        int(np.ceil(reach_y * height_m + _MARGIN_BINS)),
-        int(np.ceil(reach_x * width_m + _MARGIN_BINS)),
-        settings.device,
-    )
-    fx, fy = transform.frequencies(panel.pitch_m, panel.pitch_m)
-    inside = plan.window.contains(fx, fy, margin_per_m=_MARGIN_BINS / min(width_m, height_m))
-    window = torch.from_numpy(inside).to(settings.device)
+    transform = _transform(settings)
+    window = torch.from_numpy(_window_mask(settings)).to(settings.device)
     wanted = _spectrum(hologram, transform, grid, panel)
     start = transform.adjoint(wanted)
     clock.lap("to panel")
@@ -145,6 +136,27 @@ def _frame(
     clock.lap("levels")
     return Rendered(
         levels, phase, complex_field, clock.seconds, list(skipped), encoded.efficiency, encoded.signal_error
+    )
+
+
+@lru_cache(maxsize=2)
+def _window_mask(settings: HologramSettings) -> NDArray[np.bool_]:
+    """Return which bins of the compact spectrum lie in the pupil's image."""
+    window, panel = zone_plan(settings).window, settings.panel
+    transform, margin = _transform(settings), _MARGIN_BINS / (min(panel.width, panel.height) * panel.pitch_m)
+    return window.contains(*transform.frequencies(panel.pitch_m, panel.pitch_m), margin_per_m=margin)
+
+
+def _transform(settings: HologramSettings) -> WindowedTransform:
+    """Return the transform between the panel's pixels and the bins round the pupil's image."""
+    panel = settings.panel
+    reach_x, reach_y = zone_plan(settings).window.half_size_per_m
+    return WindowedTransform(
+        panel.height,
+        panel.width,
+        int(np.ceil(reach_y * panel.height * panel.pitch_m + _MARGIN_BINS)),
+        int(np.ceil(reach_x * panel.width * panel.pitch_m + _MARGIN_BINS)),
+        settings.device,
     )
 
 

@@ -83,6 +83,13 @@ def synthesise(
 
 def _points_of(zone: Zone, plan: ZonePlan, scene: PointGrid) -> tuple[slice, slice]:
     """Return the rows and columns of the image whose points are the zone's; borders go to the right and upper zone."""
+    if zone.warp is not None:
+        chosen = [
+            np.flatnonzero((tangent >= low) & (tangent <= high))
+            for tangent, (low, high) in zip((scene.y_tan, scene.x_tan), zone.bounds[::-1], strict=True)
+        ]
+        rows_columns = [slice(int(c[0]), int(c[-1]) + 1) if c.size else slice(0, 0) for c in chosen]
+        return rows_columns[0], rows_columns[1]
     count = len(plan.edges_x) - 1
     columns = np.clip(np.searchsorted(plan.edges_x, scene.x_tan, side="right") - 1, 0, count - 1)
     rows = count - 1 - np.clip(np.searchsorted(plan.edges_y, scene.y_tan, side="right") - 1, 0, count - 1)
@@ -149,22 +156,19 @@ def _warped_waves(
     """Return the zone's sums over its points in warped coordinates: a type-3 transform onto the footprint's samples."""
     assert zone.warp is not None
     x, y = grid.x_m[box.columns], grid.y_m[box.rows]
-    left, right = row_spans(zone.rim_m, y)
-    inside = (x > left[:, None] - grid.step_x_m) & (x < right[:, None] + grid.step_x_m)
-    warped = zone.warp.on_grid(x, y)[inside].astype(np.float32)
-    waves = np.zeros((len(scenes), *box.shape), np.complex64)
+    warped = zone.warp.on_grid(x, y).astype(np.float32)
     tilt = (2 * np.pi * shift[:, :2]).astype(np.float32)
-    waves[:, inside] = finufft.nufft2d3(
+    waves = finufft.nufft2d3(
         np.ascontiguousarray(tilt[:, 0]),
         np.ascontiguousarray(tilt[:, 1]),
         _strengths(shift[:, 2], scenes, part, bright),
-        np.ascontiguousarray(warped[:, 0]),
-        np.ascontiguousarray(warped[:, 1]),
+        np.ascontiguousarray(warped[..., 0]).ravel(),
+        np.ascontiguousarray(warped[..., 1]).ravel(),
         eps=_ACCURACY,
         isign=1,
         upsampfac=_OVERSAMPLING,
     )
-    return waves
+    return np.asarray(waves, np.complex64).reshape(len(scenes), *box.shape)
 
 
 def _zone_factor(zone: Zone, grid: Grid, box: Box, device: str) -> torch.Tensor:

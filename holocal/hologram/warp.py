@@ -1,9 +1,9 @@
-"""Warped zones: a zone's phase functions as a bilinear form in warped coordinates of the panel (docs/physics.md 4).
+"""Phase functions of a patch of the panel as a bilinear form in warped coordinates (docs/physics.md 4).
 
     phi_p(x) = a(x) + b(p) + u(p) . g(x)
 
-with g a smooth warp of the panel, close to x itself, and u the tilt. Where a thesis zone shares one wavefront up to
-tilt, g = x, and leaves 1.55 rad rms in 5 x 5 zones, the warp lets the wavefront change over the zone and leaves 0.05.
+with g a smooth warp of the panel, close to x itself, and u the tilt. A thesis zone shares one wavefront up to tilt,
+g = x, and leaves 1.55 rad rms in 5 x 5 zones; the warp lets the wavefront change over the field and leaves 0.03.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from numpy.polynomial import chebyshev
 from holocal.hologram.series import Series, fit_series
 from holocal.hologram.settings import HologramSettings
 from holocal.optics.bench import Array
-from holocal.optics.phase_function import VirtualPoints, exact_phase
+from holocal.optics.phase_function import VirtualPoints, exact_phase, pupil_rim
+from holocal.optics.raytrace import connect
 
 FIELD_NODES, PANEL_NODES = 9, 13
 PANEL_DEGREE = 5  # total, of a and g: degree 4 leaves twice the error
@@ -27,7 +28,7 @@ OUTSIDE = 1e-9  # weight of rays that miss the pupil: they only keep the fit fro
 
 @dataclass(frozen=True)
 class Box:
-    """The rectangle of the panel that a zone uses: `centre` and `half`, (2,) metres."""
+    """A rectangle of the panel: `centre` and `half`, (2,) metres."""
 
     centre: Array
     half: Array
@@ -42,7 +43,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Warp:
-    """A zone's bilinear form.
+    """The bilinear form of a part of the panel and a part of the field.
 
     Parameters
     ----------
@@ -51,7 +52,7 @@ class Warp:
     coordinate_m
         g(x) with two values, metres, over the panel.
     field
-        Over the zone's tangents, three values: u (radians per metre) and b (radians).
+        Over the field's part, three values: u (radians per metre) and b (radians).
     residual_rad
         Rms of what the form leaves of the phase, over rays through the pupil from the panel.
     """
@@ -68,9 +69,10 @@ def fit_warp(
     outline_m: Array,
     pivot_m: Array,
 ) -> Warp:
-    """Return the bilinear form of a zone: alternating least squares over traced pairs (point, panel point).
+    """Return the bilinear form of a part of the panel and a part of the field.
 
-    `bounds` are the zone's tangents ((x low, x high), (y low, y high)); `outline_m` (n, 2) what its footprints cover.
+    Alternating least squares over traced pairs (point, panel point). `bounds` are the tangents ((x low, x high),
+    (y low, y high)), `outline_m` (n, 2) corners of the panel's part.
     """
     centre = (sum(bounds[0]) / 2, sum(bounds[1]) / 2)
     half = ((bounds[0][1] - bounds[0][0]) / 2, (bounds[1][1] - bounds[1][0]) / 2)
@@ -111,6 +113,18 @@ def fit_warp(
     phase_series = over_panel(slice(0, 1))
     phase_series = Series(phase_series.coefficients[..., 0], phase_series.centre, phase_series.half)
     return Warp(phase_series, over_panel(slice(1, 3)), field, residual)
+
+
+def visible_field(settings: HologramSettings, outline_m: Array) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the tangents (x low, high), (y low, high) of what a part of the panel shows through the pupil.
+
+    With a margin of 15 % of the pupil, for a bench that is not quite where it should be.
+    """
+    rim = pupil_rim(settings.bench.pupil_diameter_m * 1.15, 32)
+    seen = connect(settings.bench, outline_m[:, None], rim, gaze_rad=settings.gaze_rad).field_tan.reshape(-1, 2)
+    nearer = 0.0 if np.isinf(settings.depth_m) else settings.bench.pupil_diameter_m / settings.depth_m
+    low, high = seen.min(axis=0) - nearer, seen.max(axis=0) + nearer
+    return (float(low[0]), float(high[0])), (float(low[1]), float(high[1]))
 
 
 def _phases(settings: HologramSettings, tangents: Array, slm_m: Array) -> tuple[Array, Array]:

@@ -18,10 +18,11 @@ from holocal.hologram.footprint import sample_footprint
 from holocal.hologram.reference import PupilWindow, pupil_window, reference_turns
 from holocal.hologram.series import Series, fit_series
 from holocal.hologram.settings import HologramSettings
-from holocal.hologram.warp import fit_warp
+from holocal.hologram.warp import fit_warp, visible_field
 from holocal.optics.bench import Array
 from holocal.optics.phase_function import PhaseFunctions, VirtualPoints, phase_functions, pupil_rim, trace_points
 
+PATCH_M = (3.6e-3, 4.04e-3)  # widest warped patch: 4 x 2 on the 4K panel, which leaves 0.05 rad rms
 OUTLINE_MARGIN = 1.15  # of the pupil: a mirror turned by 0.3 degrees moves the footprints by a tenth of their width
 _CORNERS = 6  # grid lines of corners across the field when the zones themselves have fewer
 
@@ -45,6 +46,8 @@ class Zone:
         Outline (n, 2) of the footprints of its points together.
     band_per_m
         Largest |frequency| along (x, y) of the zone's light after division by the reference.
+    bounds
+        Tangents ((x low, x high), (y low, y high)) of the points it shows.
     warp
         Warped coordinates of the panel, metres, two values; None where they are x - `pivot_m`.
     """
@@ -56,6 +59,7 @@ class Zone:
     pivot_m: Array
     rim_m: Array
     band_per_m: tuple[float, float]
+    bounds: tuple[tuple[float, float], tuple[float, float]]
     warp: Series | None = None
 
 
@@ -141,8 +145,11 @@ def point_table(settings: HologramSettings) -> PointTable:
 
 @lru_cache(maxsize=8)
 def zone_plan(settings: HologramSettings) -> ZonePlan:
-    """Return the zones of a setting: traced once, kept for the next image."""
-    table, reference = point_table(settings), reference_turns(settings)
+    """Return the zones of a setting, or its warped patches: traced once, kept for the next image."""
+    reference = reference_turns(settings)
+    if settings.warped:
+        return warped_plan(settings, reference)
+    table = point_table(settings)
     x, y = zone_borders(settings)
     zones, missing = [], []
     for row in range(settings.zones):
@@ -155,6 +162,37 @@ def zone_plan(settings: HologramSettings) -> ZonePlan:
             else:
                 zones.append(zone)
     return ZonePlan(x, y, tuple(zones), tuple(missing), reference, pupil_window(settings), len(table.traced.radius_m))
+
+
+def warped_plan(settings: HologramSettings, reference: Series) -> ZonePlan:
+    """Return the panel in patches, each with the points that it can show to the pupil, in warped coordinates.
+
+    Every pixel is computed once, there are no borders in the image, and no light is spent where it would alias into the
+    pupil: a patch shows only the points whose footprints touch it.
+    """
+    half = settings.panel.half_size_m
+    across, down = (int(np.ceil(2 * h / widest - 1e-6)) for h, widest in zip(half, PATCH_M, strict=True))
+    lines_x, lines_y = np.linspace(-half[0], half[0], across + 1), np.linspace(-half[1], half[1], down + 1)
+    limit = np.tan(np.asarray(settings.fov_rad) / 2)
+    patches, missing = [], []
+    for row in range(down):
+        for column in range(across):
+            left, right = lines_x[column], lines_x[column + 1]
+            low, high = lines_y[down - 1 - row], lines_y[down - row]
+            outline = np.array([[left, low], [right, low], [right, high], [left, high]])
+            seen = visible_field(settings, outline)
+            bounds = tuple((max(float(a), -lim), min(float(b), lim)) for (a, b), lim in zip(seen, limit, strict=True))
+            if any(b <= a for a, b in bounds):
+                missing.append((row, column))
+                continue
+            pivot = outline.mean(axis=0)
+            form = fit_warp(settings, bounds, outline, pivot)  # type: ignore[arg-type]
+            factor = form.phase_rad.times(1 / (2 * np.pi)) + (-reference)
+            shift = form.field.times(1 / (2 * np.pi))
+            band = _warped_band(factor, form.coordinate_m, shift, bounds, outline)  # type: ignore[arg-type]
+            patches.append(Zone(row, column, factor, shift, pivot, outline, band, bounds, form.coordinate_m))  # type: ignore[arg-type]
+    borders = zone_borders(settings)
+    return ZonePlan(*borders, tuple(patches), tuple(missing), reference, pupil_window(settings), 0)
 
 
 def _zone(
@@ -173,10 +211,6 @@ def _zone(
     if not len(samples):
         return None
     pivot = area @ samples
-    if settings.warped:
-        form = fit_warp(settings, bounds, rim, pivot)
-        factor, shift = form.phase_rad.times(1 / (2 * np.pi)) + (-reference), form.field.times(1 / (2 * np.pi))
-        return Zone(row, column, factor, shift, pivot, rim, _band(factor, shift, samples), form.coordinate_m)
     own = table.traced[row * settings.zones + column]
     factor = fit_series(
         lambda slm_m: own.phase(slm_m) / (2 * np.pi), degree=3, centre=(0.0, 0.0), half=settings.panel.half_size_m
@@ -186,7 +220,7 @@ def _zone(
         return tilt_difference(table.at(field_tan), own, samples, area, pivot) / (2 * np.pi)
 
     shift = fit_series(difference, degree=5, centre=centre, half=half)
-    return Zone(row, column, factor, shift, pivot, rim, _band(factor, shift, samples))
+    return Zone(row, column, factor, shift, pivot, rim, _band(factor, shift, samples), bounds)
 
 
 def zone_outline(settings: HologramSettings, bounds: tuple[tuple[float, float], tuple[float, float]]) -> Array:
@@ -240,4 +274,24 @@ def _band(factor: Series, shift: Series, samples: Array) -> tuple[float, float]:
 def _at(series: Series, points: Array) -> Array:
     """Return a series at scattered points (n, 2)."""
     in_y, in_x = series.bases(points[:, 0], points[:, 1])
-    return np.asarray(np.einsum("ni,ij,nj->n", in_y, series.coefficients, in_x))
+    return np.asarray(np.einsum("ni,ij...,nj->n...", in_y, series.coefficients, in_x))
+
+
+def _warped_band(
+    factor: Series,
+    warp: Series,
+    shift: Series,
+    bounds: tuple[tuple[float, float], tuple[float, float]],
+    outline: Array,
+) -> tuple[float, float]:
+    """Return the largest |frequency| along x and y of a patch's light at its corners, cycles per metre."""
+    step, found = 1e-6, []
+    tilt = shift.on_grid(np.array(bounds[0]), np.array(bounds[1]))[..., :2].reshape(-1, 2)
+    for axis in (0, 1):
+        ahead, behind = outline.copy(), outline.copy()
+        ahead[:, axis] += step
+        behind[:, axis] -= step
+        own = (_at(factor, ahead) - _at(factor, behind)) / (2 * step)
+        stretch = (_at(warp, ahead) - _at(warp, behind)) / (2 * step)
+        found.append(float(np.max(np.abs(own[:, None] + stretch @ tilt.T))))
+    return found[0], found[1]

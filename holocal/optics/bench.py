@@ -34,12 +34,12 @@ class Panel:
     @property
     def x_m(self) -> Array:
         """Column centres, ascending, (width,) metres in S."""
-        return (np.arange(self.width) - (self.width - 1) / 2) * self.pitch_m
+        return np.asarray((np.arange(self.width) - (self.width - 1) / 2) * self.pitch_m, np.float64)
 
     @property
     def y_m(self) -> Array:
         """Row centres, descending, (height,) metres in S."""
-        return ((self.height - 1) / 2 - np.arange(self.height)) * self.pitch_m
+        return np.asarray(((self.height - 1) / 2 - np.arange(self.height)) * self.pitch_m, np.float64)
 
     @property
     def half_size_m(self) -> tuple[float, float]:
@@ -70,7 +70,7 @@ class Pose:
         about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
         about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
         about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
-        return about_z @ about_y @ about_x
+        return np.asarray(about_z @ about_y @ about_x)
 
 
 @dataclass(frozen=True)
@@ -156,18 +156,18 @@ class Bench:
     @cached_property
     def slm_centre(self) -> Array:
         """Panel centre in E, (3,)."""
-        return self.nominal_slm_centre + self.nominal_slm_axes @ np.asarray(self.slm.shift_m)
+        return np.asarray(self.nominal_slm_centre + self.nominal_slm_axes @ np.asarray(self.slm.shift_m))
 
     @cached_property
     def slm_axes(self) -> Array:
         """Columns x, y, z of S in E, (3, 3)."""
-        return self.nominal_slm_axes @ self.slm.matrix
+        return np.asarray(self.nominal_slm_axes @ self.slm.matrix)
 
     @cached_property
     def mirror_centre(self) -> Array:
         """Centre of the ellipsoid in E, (3,)."""
         arm = self.nominal_slm_centre / 2 - self.mirror_point
-        return self.mirror_point + self.mirror.matrix @ arm + np.asarray(self.mirror.shift_m)
+        return np.asarray(self.mirror_point + self.mirror.matrix @ arm + np.asarray(self.mirror.shift_m))
 
     @cached_property
     def mirror_quadric(self) -> Array:

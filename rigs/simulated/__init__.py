@@ -4,6 +4,7 @@
 rig         the devices: panel, camera, source; `open_rig` is the plug-in's entry point
 aperture    levels on the panel -> field in the pupil of the true, misaligned bench
 kernel      the phase between a patch of the panel and the pupil, from the ray trace
+pupil       the pupil's grid and transmission
 camera      field in the pupil -> power on every pixel, integrated over it
 sensor      power -> electrons with their noise -> counts
 ==========  ===========================================================================

@@ -2,8 +2,9 @@
 
     E(s) = 1 / wavelength  sum_q  U(q) exp(i k q . s)        s = direction sines in P; |E|^2 = power per unit of d^2 s
 
-A speckle grain is 0.3 pixel (docs/physics.md 6), so the field is computed at 4 x 4 points in every pixel, at the
-directions that the lens really sends there, and its intensity is integrated, not sampled.
+A speckle grain is 0.3 pixel (docs/physics.md 6), so the field is computed at 4 x 4 points in every pixel (fewer where
+the panel is small and the grains are large), at the directions that the lens really sends there, and its intensity is
+integrated, not sampled.
 """
 
 from __future__ import annotations
@@ -16,9 +17,9 @@ import torch
 from numpy.typing import NDArray
 
 from holocal.optics.bench import Array
-from rigs.simulated.aperture import Complex, PupilGrid, unit_phase
+from rigs.simulated.pupil import Complex, PupilGrid, unit_phase
 
-SUBSAMPLES = 4  # per pixel and axis
+GRAIN_SHARE = 0.92  # of a speckle grain: the distance of the points; 4 per pixel for the 4K panel and a pupil of 3 mm
 NUFFT_EPS = 3e-4
 
 
@@ -58,14 +59,22 @@ class Lens:
 
 
 class PupilToPicture:
-    """The map from the field in the pupil to the power on every pixel, for one wavelength, lens and focus."""
+    """The map from the field in the pupil to the power on every pixel, for one wavelength, lens and focus.
 
-    def __init__(self, grid: PupilGrid, lens: Lens, wavelength_m: float, *, focus_m: float = np.inf) -> None:
+    `reach_m` is the widest part of the pupil that light of one direction fills: a small panel fills less than all.
+    """
+
+    def __init__(
+        self, grid: PupilGrid, lens: Lens, wavelength_m: float, *, focus_m: float = np.inf, reach_m: float = np.inf
+    ) -> None:
         import finufft
 
         self.lens = lens
         k = 2 * np.pi / wavelength_m
-        n, shape = SUBSAMPLES, (lens.height * SUBSAMPLES, lens.width * SUBSAMPLES)
+        grain = wavelength_m / min(reach_m, grid.x_m[-1] - grid.x_m[0])
+        pixel = 2 * np.tan(lens.field_rad / 2) / lens.width
+        n = self._subsamples = max(2, int(np.ceil(pixel / (GRAIN_SHARE * grain))))
+        shape = (lens.height * n, lens.width * n)
         columns = (np.arange(shape[1]) + 0.5) / n - 0.5
         rows = (np.arange(shape[0]) + 0.5) / n - 0.5
         phases = np.empty((2, *shape), np.float32)

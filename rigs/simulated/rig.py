@@ -18,8 +18,9 @@ from holocal.records.facts import CameraFacts, RigFacts, SlmFacts
 from holocal.records.rig import RigConfig, fingerprint
 from holocal.records.rig_model import SimulatedRig as Tables
 from holocal.units import DEGREE, MM, NM, UM
-from rigs.simulated.aperture import Complex, PanelToPupil, unit_phase
+from rigs.simulated.aperture import PanelToPupil
 from rigs.simulated.camera import Lens, PupilToPicture
+from rigs.simulated.pupil import Complex, unit_phase
 from rigs.simulated.sensor import Sensor
 
 # Photo-electrons per second and square metre of evenly lit panel: a white field of the 4K panel fills a sixth of the
@@ -27,6 +28,7 @@ from rigs.simulated.sensor import Sensor
 FLUX_E_PER_S_M2 = 1e15
 EXPOSURE_MIN_S = 1e-5
 LINE_WIDTH_M = 1e-9
+SMALLEST_DEMAGNIFICATION = 1 / 2.7  # of the panel anywhere in the field: 1 / 2.85 on the nominal bench
 
 
 def bench_of(tables: Tables) -> Bench:
@@ -112,7 +114,8 @@ class Optics:
             fill_factor=self.tables.slm.fill_factor,
             pupil_edge_m=self.tables.optics.pupil_edge_mm * MM,
         )
-        self._to_picture = PupilToPicture(self._to_pupil.grid, self.lens, wavelength_m)
+        reach_m = SMALLEST_DEMAGNIFICATION * 2 * max(self.panel.half_size_m)
+        self._to_picture = PupilToPicture(self._to_pupil.grid, self.lens, wavelength_m, reach_m=reach_m)
         self._wavelength_m = wavelength_m
 
 

@@ -70,8 +70,8 @@ def test_connect_finds_the_ray_between_two_points_and_its_path_is_stationary():
     assert found.error_m.max() < 1e-12
     # Fermat: moving the panel point by d changes the path by -direction . d, to first order
     step = 1e-7
-    moved = connect(MISALIGNED, slm + [step, 0.0], pupil).path_m
-    behind = connect(MISALIGNED, slm - [step, 0.0], pupil).path_m
+    moved = connect(MISALIGNED, slm + np.array([step, 0.0]), pupil).path_m
+    behind = connect(MISALIGNED, slm - np.array([step, 0.0]), pupil).path_m
     np.testing.assert_allclose((moved - behind) / (2 * step), -found.slm_direction[:, 0], atol=1e-8)
 
 

@@ -25,7 +25,10 @@ def render(
     depth_m: Annotated[float, typer.Option("--depth-m", help="Distance of the scene.")] = math.inf,
     wavelength_nm: options.Wavelength = 515.0,
     srgb: Annotated[bool, typer.Option("--srgb", help="Undo the sRGB curve of the image first.")] = False,
-    zones: Annotated[int, typer.Option("--zones", min=1, max=64, help="Zones along each side.")] = 5,
+    zones: Annotated[
+        int | None,
+        typer.Option("--zones", min=1, max=64, help="The thesis's method with so many zones along each side."),
+    ] = None,
     iterations: Annotated[int, typer.Option("--iterations", min=0, max=1000, help="IFTA iterations.")] = 10,
     rig: options.Rig = options.DEFAULT_RIG,
     corrections: options.Corrections = "accepted",
