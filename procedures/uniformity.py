@@ -166,7 +166,7 @@ class Uniformity:
             return
         yield self._shot(state, "dark", number, 0, dark=True)
         blobs = blob_image(state.facts.camera.height, state.facts.camera.width)
-        # The panel sends its light where the image is bright: a blob is brighter than white by the ratio of their areas.
+        # The panel sends its light where the image is bright: blobs are brighter than white by the ratio of the areas.
         exposure_s = max(state.exposure_s * float(blobs.mean()), state.facts.camera.exposure_min_s)
         yield self._shot(state, "blobs", number, 0, image=blobs, exposure_s=exposure_s, clip_limit=1.0, keep=True)
         for shot in range(chosen.measure_frames - (state.first is not None)):

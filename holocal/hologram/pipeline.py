@@ -188,13 +188,12 @@ def _undivided(hologram: torch.Tensor, plan: ZonePlan, grid: Grid, settings: Hol
 def _dark_frame(plan: ZonePlan, settings: HologramSettings, clock: Clock, keep_complex: bool) -> Rendered:
     """Return the frame that shows nothing: the uniform panel sends all light to its zero order, outside the pupil."""
     shape = (settings.panel.height, settings.panel.width)
-    skipped = [f"zone row {r + 1}, column {c + 1}: its footprint misses the panel" for r, c in plan.missing]
     return Rendered(
         np.zeros(shape, np.uint8),
         np.zeros(shape, np.float32),
         np.zeros(shape, np.complex64) if keep_complex else None,
         dict(clock.seconds),
-        [*skipped, "nothing in the image is on the panel and bright: the frame is uniform"],
+        [*plan.left_out(), "nothing in the image is on the panel and bright: the frame is uniform"],
         0.0,
     )
 

@@ -64,7 +64,7 @@ def synthesise(
         Scaled so that a point of amplitude 1 has modulus 1 in its footprint; a sentence for each thing skipped.
     """
     total = torch.zeros((len(scenes), grid.rows, grid.columns), dtype=torch.complex64, device=device)
-    skipped = [f"zone row {r + 1}, column {c + 1}: its footprint misses the panel" for r, c in plan.missing]
+    skipped = plan.left_out()
     dark = 0
     for zone in plan.zones:
         rows, columns = _points_of(zone, plan, scenes[0])
@@ -77,7 +77,8 @@ def synthesise(
         factor = _zone_factor(zone, grid, box, device)
         total[:, box.rows, box.columns].addcmul_(torch.from_numpy(waves).to(device), factor)
     if dark:
-        skipped.append(f"{dark} of {len(plan.zones)} zones on the panel: dark in the image")
+        what = "patches of" if plan.warped else "zones on"
+        skipped.append(f"{dark} of {len(plan.zones)} {what} the panel: dark in the image")
     return total, skipped
 
 

@@ -68,7 +68,8 @@ class ZonePlan:
     """All that synthesis needs for one setting; small arrays only.
 
     `edges_x`, `edges_y` (zones + 1) ascending tangents of the zones' borders; `zones` those whose footprint meets the
-    panel; `missing` the (row, column) of the others; `traced` how many virtual points were traced.
+    panel; `missing` the (row, column) of the others; `traced` how many virtual points were traced. With `warped`, the
+    zones are patches of the panel, and the missing those that show nothing of the image.
     """
 
     edges_x: Array
@@ -78,6 +79,13 @@ class ZonePlan:
     reference_turns: Series
     window: PupilWindow
     traced: int
+    warped: bool = False
+
+    def left_out(self) -> list[str]:
+        """Return a sentence for each zone or patch that no image can need."""
+        if self.warped:
+            return [f"patch row {r + 1}, column {c + 1}: shows nothing of the field" for r, c in self.missing]
+        return [f"zone row {r + 1}, column {c + 1}: its footprint misses the panel" for r, c in self.missing]
 
 
 @dataclass(frozen=True)
@@ -192,7 +200,7 @@ def warped_plan(settings: HologramSettings, reference: Series) -> ZonePlan:
             band = _warped_band(factor, form.coordinate_m, shift, bounds, outline)  # type: ignore[arg-type]
             patches.append(Zone(row, column, factor, shift, pivot, outline, band, bounds, form.coordinate_m))  # type: ignore[arg-type]
     borders = zone_borders(settings)
-    return ZonePlan(*borders, tuple(patches), tuple(missing), reference, pupil_window(settings), 0)
+    return ZonePlan(*borders, tuple(patches), tuple(missing), reference, pupil_window(settings), 0, warped=True)
 
 
 def _zone(
