@@ -25,6 +25,8 @@ from procedures._uniformity_geometry import as_seen, in_image
 
 Array = NDArray[np.float64]
 
+REFINE_FRAMES = (2, 6)  # of a step, least and most
+REFINED_NOISE = 0.016  # of a block's mean over a step's frames, relative: coarse speckle is given more frames
 VERIFICATION = 1000  # the step number that seeds the verification's initial phases
 
 
@@ -39,7 +41,7 @@ class Parameters(BaseModel):
     floor: float = Field(default=0.25, gt=0.01, lt=1.0)
     block_px: int = Field(default=33, ge=6, le=500)
     measure_frames: int = Field(default=2, ge=1, le=100)
-    refine_frames: int = Field(default=2, ge=1, le=100)
+    refine_frames: int | None = Field(default=None, ge=1, le=100)  # None: 2 to 6, as the speckle asks for
     verify_frames: int = Field(default=3, ge=2, le=100)
     max_steps: int = Field(default=2, ge=1, le=20)
     wavelength_nm: float = Field(default=515.0, gt=0.0)
@@ -75,11 +77,17 @@ class State:
     residual: tuple[float, ...]
     residual_sigma: tuple[float, ...]
     map_sigma: float
+    block_noise: float
     gamma: float
     gamma_sigma: float
     valid: NDArray[np.bool_] | None
     brightness: NDArray[np.float32] | None
     sigma: NDArray[np.float32] | None
+
+
+def refine_frames(block_noise: float) -> int:
+    """Return how many frames a step takes, from the relative noise of a block in one frame."""
+    return int(np.clip(np.ceil((block_noise / REFINED_NOISE) ** 2), *REFINE_FRAMES))
 
 
 def frame_levels(weights: NDArray[np.floating[Any]], state: State, step: int, shot: int) -> NDArray[np.uint8]:
@@ -110,8 +118,9 @@ class Uniformity:
 
     def plan(self, facts: RigFacts, parameters: Parameters) -> Plan:
         """Return what a run would do, touching nothing."""
-        refine = parameters.max_steps * parameters.refine_frames
-        frames = 3 + parameters.measure_frames + refine + parameters.verify_frames
+        refine = parameters.refine_frames
+        frames = 3 + parameters.measure_frames + parameters.verify_frames
+        frames += parameters.max_steps * (refine or REFINE_FRAMES[0])
         megapixels = facts.slm.width * facts.slm.height / 1e6
         return Plan(
             frames=frames,
@@ -121,7 +130,7 @@ class Uniformity:
             sentences=(
                 "1 frame or a few to find the exposure, 1 without light, 1 of blobs to register image and camera",
                 f"{parameters.measure_frames} frames of a white field over the camera's field",
-                f"up to {parameters.max_steps} x {parameters.refine_frames} frames of the corrected field",
+                f"up to {parameters.max_steps} steps of {refine or '2 to 6'} frames of the corrected field",
                 f"{parameters.verify_frames} frames with fresh initial phases, for the verification alone",
             ),
         )
@@ -146,6 +155,7 @@ class Uniformity:
             residual=(),
             residual_sigma=(),
             map_sigma=float("nan"),
+            block_noise=float("nan"),
             gamma=0.95,
             gamma_sigma=float("nan"),
             valid=None,
@@ -161,7 +171,7 @@ class Uniformity:
             yield self._shot(state, "exposure", 0, 0, exposure_s=state.guess_s, clip_limit=1.0)
             return
         if state.dark is not None:
-            for shot in range(chosen.refine_frames):
+            for shot in range(chosen.refine_frames or refine_frames(state.block_noise)):
                 yield self._shot(state, "corrected", number, shot)
             return
         yield self._shot(state, "dark", number, 0, dark=True)
@@ -229,8 +239,11 @@ class Uniformity:
         said = f"non-uniformity {now:.4f}, target {target:g}"
         if done == 0:
             return Judgement(Outcome.CONTINUE, f"{said}: the first correction is made")
-        if now + state.residual_sigma[-1] <= 0.7 * target:
-            return Judgement(Outcome.TARGET_MET, f"{said}: met with room; it is verified on fresh frames")
+        if state.map_sigma <= 0.7 * target and now <= 2 * target:
+            # What was shown is near enough for the map to be trusted where it is now needed: its own error is what
+            # the next correction leaves.
+            known = f"the map is known to {state.map_sigma:.4f}"
+            return Judgement(Outcome.TARGET_MET, f"{said}; {known}: corrected once more and verified on fresh frames")
         if done >= 2 and now > 2 * min(state.residual[1:]) and now > state.residual[0]:
             return Judgement(Outcome.DIVERGED, f"{said}: worse than before any correction")
         if done >= state.parameters.max_steps:
@@ -290,7 +303,7 @@ def _estimated(state: State) -> State:
     assert state.registration is not None
     seen = np.stack([as_seen(weights, state.registration) for weights in state.weights])
     log_of_step = np.log(block_means(seen, chosen.block_px).mean)
-    found, _ = fit_brightness(blocks, log_of_step[list(state.shown)], height=height, width=width, floor=chosen.floor)
+    found, used = fit_brightness(blocks, log_of_step[list(state.shown)], height=height, width=width, floor=chosen.floor)
     valid = found.valid if state.valid is None else state.valid  # the field is fixed by the first estimate
     found = replace(found, valid=valid)
     shown = found.brightness * seen[-1] ** found.gamma
@@ -308,6 +321,7 @@ def _estimated(state: State) -> State:
         residual=(*state.residual, residual),
         residual_sigma=(*state.residual_sigma, sigma),
         map_sigma=sigma,
+        block_noise=float(np.sqrt(np.median(blocks.relative_variance[used]))),
         gamma=found.gamma,
         gamma_sigma=found.gamma_sigma,
         valid=valid,

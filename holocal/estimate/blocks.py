@@ -57,7 +57,7 @@ def block_means(pictures: Array, block_px: int) -> Blocks:
     parts = np.moveaxis(parts.reshape(shape), -3, -2).reshape(*mean.shape, PARTS * PARTS)
     residual = parts - parts @ _plane_projector()
     spread = np.sum(residual**2, axis=-1) / _PLANE_FREEDOM / PARTS**2  # variance of the mean of nine parts
-    floor = 1e-3 * np.max(np.abs(mean), initial=1e-300)
+    floor = 1e-3 * np.max(np.abs(mean), initial=1e-147)  # its square is not 0
     relative = spread / np.maximum(np.abs(mean), floor) ** 2
     if relative.ndim > 2:
         relative = relative.mean(axis=0)

@@ -26,6 +26,7 @@ RECORD_BYTES = 64 * 2**20  # maps, report, checkpoints
 OFFSET_LIMIT = 0.25  # of full scale: a dark frame above it means ambient light or a wrong black level
 NOISE_LIMIT = 0.05  # of full scale
 HOT_LIMIT = 1e-3  # share of pixels
+HOT_LEVEL = 0.5  # of full scale: fainter ones are taken off with the dark frame
 MOVED_LIMIT = 3.0  # change of the picture over its noise
 LEVEL_WANTED = (0.1, 0.9)  # 99.9th percentile of the pattern's picture, of full scale
 MOST_EXPOSURES = 6
@@ -65,8 +66,10 @@ def preflight(shooter: Shooter, facts: RigFacts, plan: Plan | None, directory: P
         The picture clips at the camera's shortest exposure.
     """
     longest_s = facts.camera.exposure_max_s if plan is None else plan.exposure_ceiling_s
+    # Between the shortest and the longest: at the longest, dark current alone may fill the well of a warm camera.
+    usual_s = float(np.sqrt(facts.camera.exposure_min_s * longest_s))
     checks = [disk_room(directory, facts, plan)]
-    dark = shooter.grab(_shot("pre-flight dark", None, longest_s, facts))
+    dark = shooter.grab(_shot("pre-flight dark", None, usual_s, facts))
     checks += dark_checks(dark, facts)
     if any(item.verdict == "fail" for item in checks):
         return checks  # refused before the light goes on
@@ -116,7 +119,7 @@ def dark_checks(dark: Frame, facts: RigFacts) -> list[Check]:
     counts = np.asarray(dark.counts, np.float64)
     offset = float(np.median(counts))
     noise = float(1.4826 * np.median(np.abs(counts - offset)))  # of a normal distribution, hot pixels aside
-    hot = counts > offset + max(10.0 * noise, 0.02 * facts.camera.full_scale)
+    hot = counts > offset + max(10.0 * noise, HOT_LEVEL * facts.camera.full_scale)
     scale = facts.camera.full_scale
     return [
         check("P06a", "dark offset", offset / scale, OFFSET_LIMIT, "of full scale", "Shut out ambient light."),

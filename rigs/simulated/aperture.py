@@ -28,7 +28,7 @@ from holocal.optics.raytrace import trace_to_pupil
 from rigs.simulated.kernel import Box, PatchKernel, PathTable, Polynomial, fit_patch, interpolate
 from rigs.simulated.pupil import Complex, PupilGrid, unit_phase
 
-NUFFT_EPS = 3e-4  # relative, each patch; the phase model's 0.01 rad is the larger error
+NUFFT_EPS = 1e-3  # relative, each patch; the phase model's 0.008 rad is the larger error
 TAPS = 16  # of the polyphase filter, per output sample
 OVERSAMPLING = 1.4  # of the coarse grids, against the widest piece's bandwidth: 16 taps then leave 1e-3
 PATCH_PX = (256, 240)  # widest patch, columns and rows, for a phase error below 0.01 rad rms

@@ -20,7 +20,7 @@ from holocal.optics.bench import Array
 from rigs.simulated.pupil import Complex, PupilGrid, unit_phase
 
 GRAIN_SHARE = 0.92  # of a speckle grain: the distance of the points; 4 per pixel for the 4K panel and a pupil of 3 mm
-NUFFT_EPS = 3e-4
+NUFFT_EPS = 1e-3  # relative, of the field
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from rigs.simulated.sensor import Sensor
 # Photo-electrons per second and square metre of evenly lit panel: a white field of the 4K panel fills a sixth of the
 # well in about 10 ms.
 FLUX_E_PER_S_M2 = 1e15
-EXPOSURE_MIN_S = 1e-5
+EXPOSURE_MIN_S = 3e-5
 LINE_WIDTH_M = 1e-9
 SMALLEST_DEMAGNIFICATION = 1 / 2.7  # of the panel anywhere in the field: 1 / 2.85 on the nominal bench
 

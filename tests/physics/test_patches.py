@@ -40,9 +40,7 @@ def test_patches_leave_a_twentieth_of_a_radian_of_every_points_phase(settings):
         slm = rng.uniform((left, low), (right, high), (200, 2))
         tangents = rng.uniform(*np.array(patch.bounds).T, (40, 2))
         points = VirtualPoints.at(tangents[:, None], settings.depth_m)
-        exact = exact_phase(
-            settings.bench, points, slm, wavelength_m=settings.wavelength_m, gaze_rad=settings.gaze_rad
-        )
+        exact = exact_phase(settings.bench, points, slm, wavelength_m=settings.wavelength_m, gaze_rad=settings.gaze_rad)
         seen = np.linalg.norm(exact.pupil_m, axis=-1) <= settings.bench.pupil_diameter_m / 2
         common = at(patch.factor_turns, slm) + at(plan.reference_turns, slm)
         field = at(patch.shift, tangents)
