@@ -166,9 +166,9 @@ def _figures(
             "weight",
             "What the image is multiplied by",
             "map",
-            {"weight": state.weights[-1], "valid": mask},
+            {"weight": state.weights[-1]},
             "intensity",
-            "The correction that `accept` puts in force.",
+            "The correction that `accept` puts in force, in the image's own directions.",
             extent,
         ),
         Figure(

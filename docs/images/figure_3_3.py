@@ -129,8 +129,9 @@ def main() -> None:
 
 def draw(pictures: dict[str, Array], field_deg: float, out: Path) -> None:
     """Draw each picture, and its four texts enlarged below it."""
-    figure = plt.figure(figsize=(15, 8.2), facecolor="white", layout="constrained")
-    grid = figure.add_gridspec(2, 3, height_ratios=(2.5, 2))
+    figure = plt.figure(figsize=(15, 6.85), facecolor="white")
+    frame = {"left": 0.005, "right": 0.995, "bottom": 0.01, "top": 0.94}
+    grid = figure.add_gridspec(2, 3, height_ratios=(4.0, 2.1), wspace=0.02, hspace=0.03, **frame)
     for column, (name, picture) in enumerate(pictures.items()):
         pixels = picture.shape[0]
         left, top = pixel_of((-8.5, 6.8), pixels, field_deg)

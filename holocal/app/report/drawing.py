@@ -62,7 +62,11 @@ def convergence(steps: Sequence[Mapping[str, Any]]) -> str | None:
     """Return the goal's number of every step with its sigma and the target line; None when there is nothing to draw."""
     from matplotlib import rc_context
 
-    points = [(step["step"], step["progress"]) for step in steps if _is_number(step["progress"].get("value"))]
+    points = [
+        (step["step"], step["progress"])
+        for step in steps
+        if _is_number(step["progress"].get("value")) and _is_number(step["progress"].get("target"))
+    ]
     if not points:
         return None
     numbers = [number for number, _ in points]
