@@ -103,7 +103,8 @@ def inscribed_rectangle(valid: NDArray[np.bool_]) -> tuple[int, int, int, int]:
     """
     step = 4
     rows, columns = (size // step for size in valid.shape)
-    coarse = valid[: rows * step, : columns * step].reshape(rows, step, columns, step).all(axis=(1, 3))
+    cells = valid[: rows * step, : columns * step].reshape(rows, step, columns, step)
+    coarse = np.asarray(cells.all(axis=(1, 3)))
     heights = np.zeros(coarse.shape[1] + 1, int)
     best, found = 0, (0, 0, 0, 0)
     for row, line in enumerate(coarse):

@@ -40,6 +40,13 @@ def write_counts(path: Path, counts: NDArray[np.uint16]) -> None:
     write_bytes(path, encode_png(np.asarray(counts, np.uint16)))
 
 
+def write_picture(path: Path, counts: NDArray[np.uint16]) -> None:
+    """Write counts as an 8-bit picture to look at: black at the darkest percent, white at the brightest thousandth."""
+    dark, bright = np.quantile(counts, [0.01, 0.999])
+    shown = np.clip((counts.astype(np.float32) - dark) * (255 / max(bright - dark, 1)), 0, 255)
+    write_bytes(path, encode_png(np.rint(shown).astype(np.uint8)))
+
+
 def encode_png(pixels: NDArray[Any]) -> bytes:
     """Return the bytes of a PNG; colour in OpenCV's order, blue first."""
     done, data = cv2.imencode(".png", np.ascontiguousarray(pixels), [cv2.IMWRITE_PNG_COMPRESSION, COMPRESSION])

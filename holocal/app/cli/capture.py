@@ -13,7 +13,9 @@ from holocal.app.cli import options
 def capture(
     frame: Annotated[Path, typer.Argument(metavar="FRAME", help="A frame that `holocal render` wrote.")],
     out: Annotated[Path, typer.Option("--out", help="The counts to write, OpenEXR.")] = Path("image.exr"),
-    png: Annotated[Path | None, typer.Option("--png", help="The counts as a 16-bit PNG, too.")] = None,
+    png: Annotated[
+        Path | None, typer.Option("--png", help="A picture to look at, too: 8 bits, the brightest thousandth white.")
+    ] = None,
     exposure_s: Annotated[
         float | None, typer.Option("--exposure-s", help="Exposure; default: found for 60 % of full scale.")
     ] = None,
@@ -34,7 +36,7 @@ def capture(
     from holocal.app.session import claimed_rig
     from holocal.app.terminal import Terminal, emit, emit_json
     from holocal.loop.devices import Repeatable
-    from holocal.records.frames import read_frame, write_counts
+    from holocal.records.frames import read_frame, write_picture
     from holocal.units import NM
 
     check(out, png, exposure_s, wavelength_nm)
@@ -50,7 +52,7 @@ def capture(
     metadata = capture_metadata(taken, facts.camera, wavelength_m=wavelength_nm * NM)
     write_capture(out, taken, metadata)
     if png is not None:
-        write_counts(png, taken.counts)
+        write_picture(png, taken.counts)
     if json:
         seconds = time.monotonic() - began
         emit_json({"schema": 1, "image": str(out), "rig": config.name, **metadata, "seconds": seconds})
