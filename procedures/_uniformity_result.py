@@ -45,9 +45,9 @@ def beside_thesis(state: State, verified: Image, block_px: int) -> dict[str, flo
     out = {}
     for name, frame in (("thesis_mean", white.mean(axis=0)), ("thesis_single", white[0])):
         seen = at_size(thesis_map(frame), *valid.shape)
-        ratio = (1 / np.maximum(seen, 1e-6 * seen.max()) / corrected) ** state.gamma
+        ratio = (1 / np.maximum(seen, 0.05 * seen.max()) / corrected) ** state.gamma
         ratio /= ratio[valid].mean()
-        found = _measured(verified * np.where(valid, ratio, 0.0), valid, block_px=block_px)
+        found = _measured(verified * ratio, valid, block_px=block_px)
         out[f"{name}_nonuniformity_rms"] = found.rms
         out[f"{name}_nonuniformity_9pt"] = found.nine_point
     return out

@@ -21,7 +21,7 @@ from holocal.loop.devices import Frame
 from holocal.loop.procedure import Conclusion, Judgement, Outcome, Plan, Shot
 from holocal.records.facts import RigFacts
 from procedures._uniformity_exposure import with_exposure
-from procedures._uniformity_geometry import as_seen, in_image
+from procedures._uniformity_geometry import as_seen, image_region, in_image
 
 Array = NDArray[np.float64]
 
@@ -297,13 +297,18 @@ def _estimated(state: State) -> State:
     from holocal.estimate.brightness import fit_brightness, weights_for
     from procedures._uniformity_result import thesis_weights
 
-    chosen, facts = state.parameters, state.facts
-    height, width = facts.camera.height, facts.camera.width
+    chosen = state.parameters
     blocks = block_means(state.frames.astype(np.float64), chosen.block_px)
     assert state.registration is not None
     seen = np.stack([as_seen(weights, state.registration) for weights in state.weights])
     log_of_step = np.log(block_means(seen, chosen.block_px).mean)
-    found, used = fit_brightness(blocks, log_of_step[list(state.shown)], height=height, width=width, floor=chosen.floor)
+    found, used = fit_brightness(
+        blocks,
+        log_of_step[list(state.shown)],
+        shown=image_region(state.registration),
+        block_px=chosen.block_px,
+        floor=chosen.floor,
+    )
     valid = found.valid if state.valid is None else state.valid  # the field is fixed by the first estimate
     found = replace(found, valid=valid)
     shown = found.brightness * seen[-1] ** found.gamma

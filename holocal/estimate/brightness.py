@@ -20,7 +20,7 @@ from scipy.ndimage import distance_transform_edt
 from skimage.measure import label
 
 from holocal.errors import InputError
-from holocal.estimate.blocks import Array, Blocks
+from holocal.estimate.blocks import Array, Blocks, block_means
 
 # The noise that phase-only encoding leaves in the pupil lifts the dark: 0.93 to 0.96 after 10 iterations of IFTA.
 GAMMA_MEAN, GAMMA_SIGMA = 0.95, 0.15
@@ -64,7 +64,7 @@ class Posterior:
 
 
 def fit_brightness(
-    blocks: Blocks, log_weights: Array, *, height: int, width: int, floor: float
+    blocks: Blocks, log_weights: Array, *, shown: NDArray[np.bool_], block_px: int, floor: float
 ) -> tuple[BrightnessMap, NDArray[np.bool_]]:
     """Return the map of frames whose block means are `blocks`, and which blocks it is fitted on, (rows, columns).
 
@@ -74,8 +74,10 @@ def fit_brightness(
         Means (frames, rows, columns).
     log_weights
         Log of the mean weight that each block was shown with, (frames, rows, columns).
-    height, width
-        Of the picture, pixels.
+    shown
+        Where the picture shows the image, (height, width): beyond the image's border nothing can be corrected.
+    block_px
+        As it was given to `block_means`.
     floor
         Share of the brightest below which the field counts as not correctable.
 
@@ -95,7 +97,9 @@ def fit_brightness(
             limit=0.0,
             code="no-light",
         )
-    used = (natural > FAINT * floor * brightest) & np.all(blocks.mean > 0, axis=0)
+    height, width = shown.shape
+    inside = block_means(shown.astype(np.float64), block_px).mean > 1 - 1e-9
+    used = inside & (natural > FAINT * floor * brightest) & np.all(blocks.mean > 0, axis=0)
     if np.count_nonzero(used) < 9:
         raise InputError(
             f"Only {np.count_nonzero(used)} blocks of {used.size} are lit; a map needs 9.",
@@ -114,7 +118,7 @@ def fit_brightness(
     best = int(np.argmax([fit.evidence for fit in fits]))
     fit, (length, size) = fits[best], candidates[best]
     log_map, sigma = _everywhere(fit, at, length, size, height, width)
-    valid = _correctable(log_map, floor, margin_px=height // blocks.mean.shape[-2])
+    valid = _correctable(np.where(shown, log_map, -np.inf), floor, margin_px=block_px)
     brightness = np.exp(log_map - log_map[valid].max())
     found = BrightnessMap(brightness, sigma, valid, fit.gamma, float(np.sqrt(fit.gamma_variance)), length)
     return found, used

@@ -57,13 +57,19 @@ def measure_uniformity(pictures: Array, valid: NDArray[np.bool_], *, block_px: i
             measured=count,
             limit=9,
         )
-    means = blocks.mean.mean(axis=0)[inside]
-    noise = float(np.mean(blocks.relative_variance[inside])) / len(pictures)
-    relative = means / means.mean() - 1
+    each = blocks.mean[:, inside] / blocks.mean[:, inside].mean()
+    relative = each.mean(axis=0) / each.mean() - 1
     variance = float(np.mean(relative**2)) * count / (count - 1)
+    frames = len(pictures)
+    if frames > 1:  # independent frames tell the noise whatever the size of the grains
+        noise = float(np.mean(np.var(each, axis=0, ddof=1))) / frames
+        noise_error = noise * np.sqrt(2 / (count * (frames - 1)))
+    else:
+        noise = float(np.mean(blocks.relative_variance[inside]))
+        noise_error = 0.3 * noise  # grains as large as a third of a block are under-estimated by that much
     own = variance - noise
-    # The blocks' sample variance scatters by sqrt(2 / count) of itself; the noise is known from many more parts.
-    error = np.sqrt(2 / count) * (max(own, 0) + noise)
+    # The blocks' sample variance scatters by sqrt(2 / count) of itself.
+    error = float(np.hypot(np.sqrt(2 / count) * (max(own, 0) + noise), noise_error))
     rms = float(np.sqrt(max(own, 0.0)))
     sigma = float(error / (2 * rms)) if own > error else float(np.sqrt(error))
     points, point_noise = _nine_points(scaled, valid, block_px)

@@ -1,7 +1,7 @@
 """The wave's phase between a patch of the panel and the pupil, as polynomials.
 
 From the panel point x to the pupil point q the light's phase is k L(x, q), with L the length of the traced ray. Over a
-small patch of the panel it is, to about 0.01 rad (rms, 320 x 270 pixels, whole pupil), the sum of a function of x, one
+small patch of the panel it is, to about 0.01 rad (rms, 256 x 240 pixels, whole pupil), the sum of a function of x, one
 of q, and two products u(q) g(x). The four are found from the ray trace by a singular value decomposition, so nothing
 here knows how the hologram engine thinks of the same bench: that one works between panel and field, this one between
 panel and pupil, where the pupil is an exact mask.

@@ -58,7 +58,7 @@ def test_both_estimators_find_the_true_brightness_and_the_fit_is_nearer(pictures
     truth = np.load(DATA / "truth.npy").astype(float)
     assert truth.max() == pytest.approx(1.0) and truth.min() == pytest.approx(0.25, rel=1e-3)
     blocks = block_means(pictures, 15)
-    found, _ = fit_brightness(blocks, np.zeros((2, 20, 20)), height=300, width=300, floor=0.3)
+    found, _ = fit_brightness(blocks, np.zeros((2, 20, 20)), shown=np.ones((300, 300), bool), block_px=15, floor=0.3)
     thesis = at_size(thesis_map(pictures.mean(axis=0)), 300, 300)
     left = {}
     for name, estimate in (("fit", found.brightness), ("thesis", thesis)):

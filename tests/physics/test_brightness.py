@@ -14,6 +14,7 @@ from holocal.estimate.thesis_map import BLOCK_PX, SIGMA_PX, WINDOW_PX, at_size, 
 
 SIZE, BLOCK = 750, 33  # the thesis's capture; its blocks of 100 of 2300 pixels are 33 of 750
 FIELD = uneven_field(SIZE, SIZE)
+EVERYWHERE = np.ones((SIZE, SIZE), bool)
 NO_WEIGHTS = np.zeros((1, 23, 23))
 
 
@@ -31,7 +32,7 @@ def four_frames():
 @pytest.fixture(scope="module")
 def fitted(four_frames):
     blocks = block_means(four_frames, BLOCK)
-    return fit_brightness(blocks, np.repeat(NO_WEIGHTS, 4, axis=0), height=SIZE, width=SIZE, floor=0.2)[0]
+    return fit_brightness(blocks, np.repeat(NO_WEIGHTS, 4, axis=0), shown=EVERYWHERE, block_px=BLOCK, floor=0.2)[0]
 
 
 def test_block_means_are_the_plain_means_of_an_oblong_picture():
@@ -89,7 +90,7 @@ def test_the_thesis_map_of_the_same_frames_leaves_more(four_frames, fitted):
 @pytest.mark.parametrize("seed", [5, 6])
 def test_sigma_is_what_the_map_is_wrong_by(seed):
     blocks = block_means(frames_of(FIELD, seed=seed, count=2), BLOCK)
-    found, _ = fit_brightness(blocks, np.repeat(NO_WEIGHTS, 2, axis=0), height=SIZE, width=SIZE, floor=0.2)
+    found, _ = fit_brightness(blocks, np.repeat(NO_WEIGHTS, 2, axis=0), shown=EVERYWHERE, block_px=BLOCK, floor=0.2)
     error = np.log(found.brightness / FIELD)
     error -= error[found.valid].mean()  # what all places share is not known
     pull = float(np.sqrt(np.mean((error / found.sigma)[found.valid] ** 2)))
@@ -103,7 +104,7 @@ def test_the_exponent_of_the_response_is_found_from_frames_with_unlike_weights(g
     pictures = np.concatenate([frames_of(FIELD * w**gamma, seed=7 + i, count=1) for i, w in enumerate(seen)])
     pictures *= np.array([1.0, 1.0, 1.9, 1.9])[:, None, None]  # a panel sends elsewhere the light that is not wanted
     log_weights = np.log(block_means(np.stack(seen), BLOCK).mean)
-    found, _ = fit_brightness(block_means(pictures, BLOCK), log_weights, height=SIZE, width=SIZE, floor=0.2)
+    found, _ = fit_brightness(block_means(pictures, BLOCK), log_weights, shown=EVERYWHERE, block_px=BLOCK, floor=0.2)
     assert abs(found.gamma - gamma) < 3 * found.gamma_sigma
     assert found.gamma_sigma < 0.03  # weights from 1/4 to 1 against 1 % of noise per block know it well
     assert left(found.brightness, FIELD, found.valid) <= 0.012  # the exponent takes a share of the four frames
@@ -112,7 +113,7 @@ def test_the_exponent_of_the_response_is_found_from_frames_with_unlike_weights(g
 def test_an_all_dark_picture_is_refused():
     dark = block_means(np.zeros((2, 300, 300)), 30)
     with pytest.raises(InputError, match="no light") as caught:
-        fit_brightness(dark, np.zeros((2, 10, 10)), height=300, width=300, floor=0.25)
+        fit_brightness(dark, np.zeros((2, 10, 10)), shown=np.ones((300, 300), bool), block_px=30, floor=0.25)
     assert caught.value.code == "no-light"
 
 
@@ -121,7 +122,7 @@ def test_twenty_hot_pixels_hardly_change_the_map(four_frames, fitted):
     places = generator(8).integers(0, SIZE, (20, 2))
     hot[:, places[:, 0], places[:, 1]] = 4095.0  # full scale, ten times the brightest mean
     blocks = block_means(hot, BLOCK)
-    found, _ = fit_brightness(blocks, np.repeat(NO_WEIGHTS, 4, axis=0), height=SIZE, width=SIZE, floor=0.2)
+    found, _ = fit_brightness(blocks, np.repeat(NO_WEIGHTS, 4, axis=0), shown=EVERYWHERE, block_px=BLOCK, floor=0.2)
     both = found.valid & fitted.valid
     change = np.log(found.brightness / fitted.brightness)[both]
     assert float(change.std()) < 0.01

@@ -230,7 +230,7 @@ def test_pixels_with_an_area_send_less_light_away_from_the_zero_order():
     y = to_pupil.grid.y_m
     upper, lower = y > 0.7e-3, y < -0.7e-3
     envelope = [np.sum(ratio[:, part]) / np.sum(np.abs(points[:, part]) ** 2) for part in (upper, lower)]
-    # sinc^2 of the distance from the zero order, +-1.1 mm of 6.6 mm per order spacing off its half: 0.68 and 0.20
+    # sinc^2 of the distance from the zero order, +-1 mm of 6.6 mm per order spacing off its half: 0.66 and 0.19
     assert envelope[0] == pytest.approx(0.65, abs=0.08)
     assert envelope[1] == pytest.approx(0.20, abs=0.06)
 
