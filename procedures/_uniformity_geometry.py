@@ -8,9 +8,36 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from holocal.errors import RefusedError
 from holocal.estimate.registration import Registration
 
 Array = NDArray[np.float64]
+
+# Blobs that are found lie within 0.5 px of a smooth map; forced on a mirrored or turned picture, 7 px and more off it.
+RESIDUAL_SHARE = 0.004  # of the picture's width: 3 px of 750
+FEWEST_BLOBS = 6
+
+
+def require_registered(found: Registration) -> Registration:
+    """Return the registration if it can be believed.
+
+    Raises
+    ------
+    RefusedError
+        The blobs of the picture are not those of the image.
+    """
+    limit_px = RESIDUAL_SHARE * found.width
+    if found.found >= FEWEST_BLOBS and found.residual_px <= limit_px:
+        return found
+    raise RefusedError(
+        f"The camera's picture does not fit the image: {found.found} of {found.shown} blobs were found, "
+        f"{found.residual_px:.1f} px (rms) off a smooth map; the limits are {FEWEST_BLOBS} and {limit_px:.1f} px.",
+        why="A brightness map put on the image in the wrong place makes it worse.",
+        fix="Check that the camera's picture is neither mirrored nor turned by more than a few degrees, and in focus.",
+        measured={"found": found.found, "residual_px": found.residual_px},
+        limit={"found": FEWEST_BLOBS, "residual_px": limit_px},
+        code="not-registered",
+    )
 
 
 def as_seen(image: NDArray[np.floating[Any]], registration: Registration) -> Array:

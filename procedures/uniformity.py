@@ -21,7 +21,7 @@ from holocal.loop.devices import Frame
 from holocal.loop.procedure import Conclusion, Judgement, Outcome, Plan, Shot
 from holocal.records.facts import RigFacts
 from procedures._uniformity_exposure import with_exposure
-from procedures._uniformity_geometry import as_seen, image_region, in_image
+from procedures._uniformity_geometry import as_seen, image_region, in_image, require_registered
 
 Array = NDArray[np.float64]
 
@@ -190,7 +190,7 @@ class Uniformity:
         taken: list[NDArray[np.float32]] = []
         if state.dark is None:
             dark, blobs, frames = frames[0].counts.astype(np.float32), frames[1], frames[2:]
-            found = register(brightness_of(blobs, dark).astype(np.float64))
+            found = require_registered(register(brightness_of(blobs, dark).astype(np.float64)))
             state = replace(state, dark=dark, registration=found)
             if state.first is not None:
                 taken.append(state.first - dark / np.float32(state.exposure_s))

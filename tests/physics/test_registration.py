@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 from synthetic import generator, speckle
 
+from holocal.errors import RefusedError
 from holocal.estimate.registration import blob_image, blob_places, register
+from procedures._uniformity_geometry import require_registered
 
 SIZE = 750
 MIDDLE = (SIZE - 1) / 2
@@ -124,3 +126,12 @@ def test_the_blobs_lie_inside_the_image_and_never_touch():
     assert places.min() > 0 and places.max() < SIZE - 1
     apart = np.linalg.norm(places[:, None] - places[None], axis=-1) + 1e3 * np.eye(len(places))
     assert apart.min() > 2 * 3 * 0.008 * SIZE * 0.8  # windows of three sigma overlap by a fifth at most
+
+
+@pytest.mark.parametrize("turn", [np.fliplr, np.flipud, np.rot90], ids=["mirrored", "upside down", "turned"])
+def test_a_mirrored_or_turned_camera_is_refused_with_its_numbers(turn):
+    picture = turn(blob_image(300, 300)).copy()
+    with pytest.raises(RefusedError, match="blobs were found") as caught:
+        require_registered(register(picture))
+    assert caught.value.exit_status == 4
+    assert require_registered(register(blob_image(300, 300))).residual_px < 0.1
