@@ -146,7 +146,9 @@ def test_patches_of_21_by_21_field_points_around_five_directions(bench):
     modulation = white_modulation(panel)
     to_pupil = PanelToPupil(bench, panel, WAVELENGTH_M, pupil_edge_m=3e-4)
     field = to_pupil.field(modulation)
-    for direction in ((0.0, 0.0), (-4.0, -2.0), (3.0, -4.0), (5.0, 2.0), (-1.0, 4.0)):
+    # Directions that this small panel lights on both benches: where the pupil's rim cuts nearly all of it off, what is
+    # left out of the sum is the second order of the rim's diffraction.
+    for direction in ((0.0, 0.0), (-4.0, -2.0), (3.0, -4.0), (2.0, 1.0), (-2.0, 1.5)):
         tangents = patch_of_directions(direction, 21)
         exact = field_by_direct_sum(bench, panel, modulation, tangents, edge_m=3e-4)
         assert relative_error(field_from_pupil(to_pupil, field, tangents), exact) < 0.01
