@@ -96,7 +96,7 @@ def invoke(arguments: Sequence[str]) -> int:
     except BrokenPipeError:  # `holocal show RUN | head`
         sys.stderr.close()
         return 0
-    except Exception as error:
+    except Exception as error:  # the last border: a bug is one line and status 1 (contract), its traceback in the log
         if debug:
             raise
         what = f"{type(error).__name__}: {error}"
