@@ -41,10 +41,10 @@ def test_the_way_back_is_the_adjoint(rows, columns, reach_rows, reach_columns):
     assert abs(complex(left - right)) < 1e-5 * rows * columns
 
 
-def test_update_is_subtract_constrain_and_transform():
+def test_update_is_add_constrain_and_transform():
     transform = WindowedTransform(230, 50, 30, 12)  # more than two blocks of rows
     data, spectrum = random_field(230, 50, 3), random_field(61, 25, 4)
-    wanted = unit_modulus(data - transform.adjoint(spectrum))
+    wanted = unit_modulus(data + transform.adjoint(spectrum))
     found = transform.update(data, spectrum, unit_modulus)
     assert torch.allclose(data, wanted, atol=1e-5)
     assert torch.allclose(found, transform.forward(wanted), atol=1e-4)

@@ -8,27 +8,14 @@ as wide as the band. On the CPU scipy's FFT is used: a pair at 3840 x 2160 compl
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-import scipy.fft
 import torch
 
+from holocal.hologram.encode.blocks import Lines, block_length, fft, in_blocks, lines
 from holocal.optics.bench import Array
-
-_BLOCK = 96  # rows at a time: 3 MB at 4K
-_WORKERS = 2  # on two cores; more did not change the result, and an FFT is limited by memory
-
-
-def transform(data: torch.Tensor, *, dim: int, inverse: bool = False) -> torch.Tensor:
-    """Return the orthonormal FFT along one axis; the input's memory may be reused for the result."""
-    if data.device.type != "cpu":
-        spectrum: torch.Tensor = (torch.fft.ifft if inverse else torch.fft.fft)(data, dim=dim, norm="ortho")
-        return spectrum
-    make = scipy.fft.ifft if inverse else scipy.fft.fft
-    return torch.from_numpy(make(data.numpy(), axis=dim, norm="ortho", overwrite_x=True, workers=_WORKERS))
-
 
 @dataclass
 class WindowedTransform:
@@ -52,15 +39,17 @@ class WindowedTransform:
     reach_rows: int
     reach_columns: int
     device: str = "cpu"
-    _tall: torch.Tensor = field(init=False, repr=False)
-    _block: torch.Tensor = field(init=False, repr=False)
+    _tall: Lines = field(init=False, repr=False)  # (rows, 2 k_x + 1): transformed along x only
 
     def __post_init__(self) -> None:
         self.reach_rows = min(self.reach_rows, (self.rows - 1) // 2)
         self.reach_columns = min(self.reach_columns, (self.columns - 1) // 2)
-        block = min(_BLOCK, self.rows) if torch.device(self.device).type == "cpu" else self.rows
-        self._block = torch.empty((block, self.columns), dtype=torch.complex64, device=self.device)
-        self._tall = torch.empty((self.rows, 2 * self.reach_columns + 1), dtype=torch.complex64, device=self.device)
+        self._tall = lines(self._empty(self.rows, self.shape[1]))
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Shape of a compact array."""
+        return 2 * self.reach_rows + 1, 2 * self.reach_columns + 1
 
     def frequencies(self, step_x_m: float, step_y_m: float) -> tuple[Array, Array]:
         """Return fx (2 k_x + 1,) and fy (2 k_y + 1,) of a compact array, cycles per metre; +fy is up, rows run down."""
@@ -71,66 +60,108 @@ class WindowedTransform:
 
     def forward(self, data: torch.Tensor) -> torch.Tensor:
         """Return the compact spectrum of a field; the field is kept."""
-        for part in self._parts():
-            self._rows_forward(data[part], self._tall[part])
+        rows = lines(data)
+
+        def work(part: slice) -> None:
+            block = lines(self._empty(*rows[part].shape))
+            block[:] = rows[part]
+            self._rows_forward(block, part)
+
+        self._row_blocks(work)
         return self._columns_forward()
 
     def adjoint(self, compact: torch.Tensor) -> torch.Tensor:
         """Return the field of a compact spectrum, zero outside it."""
-        out = torch.empty((self.rows, self.columns), dtype=torch.complex64, device=self.device)
+        out = self._empty(self.rows, self.columns)
+        rows = lines(out)
+
+        def work(part: slice) -> None:
+            rows[part] = self._rows_inverse(part)
+
         self._columns_inverse(compact)
-        for part in self._parts():
-            out[part] = self._rows_inverse(self._tall[part])
+        self._row_blocks(work)
         return out
 
     def update(
         self, data: torch.Tensor, compact: torch.Tensor, constrain: Callable[[torch.Tensor], object]
     ) -> torch.Tensor:
-        """Subtract the adjoint of `compact` from a field, constrain it row block by row block, return its new spectrum.
+        """Add the adjoint of `compact` to a field, constrain it row block by row block, return its new spectrum.
 
-        `data` is changed in place; `constrain` changes a block of rows in place.
+        `data` is changed in place; `constrain` changes a block of rows in place, in whichever thread has it.
         """
+        rows = lines(data)
+
+        def work(part: slice) -> None:
+            block = self._rows_inverse(part)
+            block += rows[part]
+            constrain(torch.as_tensor(block))
+            rows[part] = block
+            self._rows_forward(block, part)
+
         self._columns_inverse(compact)
-        for part in self._parts():
-            data[part].sub_(self._rows_inverse(self._tall[part]))
-            constrain(data[part])
-            self._rows_forward(data[part], self._tall[part])
+        self._row_blocks(work)
         return self._columns_forward()
 
-    def _parts(self) -> Iterator[slice]:
-        step = len(self._block)
-        return (slice(top, min(top + step, self.rows)) for top in range(0, self.rows, step))
+    def _rows_forward(self, block: Lines, part: slice) -> None:
+        _gather(fft(block, axis=1), self._tall[part], self.reach_columns, axis=1)
 
-    def _rows_forward(self, rows: torch.Tensor, tall: torch.Tensor) -> None:
-        block = self._block[: len(rows)]
-        block.copy_(rows)
-        _gather(transform(block, dim=1), tall, self.reach_columns, dim=1)
-
-    def _rows_inverse(self, tall: torch.Tensor) -> torch.Tensor:
-        block = self._block[: len(tall)]
-        _scatter(tall, block, self.reach_columns, dim=1)
-        return transform(block, dim=1, inverse=True)
+    def _rows_inverse(self, part: slice) -> Lines:
+        tall = self._tall[part]
+        block = lines(self._empty(len(tall), self.columns))
+        _scatter(tall, block, self.reach_columns, axis=1)
+        return fft(block, axis=1, inverse=True)
 
     def _columns_forward(self) -> torch.Tensor:
-        compact = torch.empty((2 * self.reach_rows + 1, self._tall.shape[1]), dtype=torch.complex64, device=self.device)
-        _gather(transform(self._tall, dim=0), compact, self.reach_rows, dim=0)
+        compact = self._empty(*self.shape)
+        out = lines(compact)
+
+        def work(part: slice) -> None:
+            tall = self._tall[:, part]
+            block = lines(self._empty(*tall.shape))
+            block[:] = tall
+            _gather(fft(block, axis=0), out[:, part], self.reach_rows, axis=0)
+
+        self._column_blocks(work)
         return compact
 
     def _columns_inverse(self, compact: torch.Tensor) -> None:
-        _scatter(compact, self._tall, self.reach_rows, dim=0)
-        self._tall = transform(self._tall, dim=0, inverse=True)
+        given = lines(compact)
+
+        def work(part: slice) -> None:
+            columns = given[:, part]
+            block = lines(self._empty(self.rows, columns.shape[1]))
+            _scatter(columns, block, self.reach_rows, axis=0)
+            self._tall[:, part] = fft(block, axis=0, inverse=True)
+
+        self._column_blocks(work)
+
+    def _empty(self, rows: int, columns: int) -> torch.Tensor:
+        return torch.empty((rows, columns), dtype=torch.complex64, device=self.device)
+
+    def _row_blocks(self, work: Callable[[slice], None]) -> None:
+        in_blocks(work, self.rows, block_length(self.columns, self.rows, self.device))
+
+    def _column_blocks(self, work: Callable[[slice], None]) -> None:
+        in_blocks(work, self.shape[1], block_length(self.rows, self.shape[1], self.device))
 
 
-def _gather(full: torch.Tensor, compact: torch.Tensor, reach: int, *, dim: int) -> None:
+def _bands(reach: int, length: int, axis: int) -> tuple[tuple[slice, ...], tuple[slice, ...], tuple[slice, ...]]:
+    """Return where frequencies 0..reach, those beyond, and -reach..-1 stand among `length` along an axis."""
+    parts = slice(0, reach + 1), slice(reach + 1, length - reach), slice(length - reach, length)
+    before = (slice(None),) * axis
+    return (*before, parts[0]), (*before, parts[1]), (*before, parts[2])
+
+
+def _gather(full: Lines, compact: Lines, reach: int, *, axis: int) -> None:
     """Copy frequencies 0..reach and -reach..-1 of `full` into `compact`."""
-    compact.narrow(dim, 0, reach + 1).copy_(full.narrow(dim, 0, reach + 1))
-    if reach:
-        compact.narrow(dim, reach + 1, reach).copy_(full.narrow(dim, full.shape[dim] - reach, reach))
+    first, _, last = _bands(reach, full.shape[axis], axis)
+    into_first, _, into_last = _bands(reach, compact.shape[axis], axis)
+    compact[into_first], compact[into_last] = full[first], full[last]
 
 
-def _scatter(compact: torch.Tensor, full: torch.Tensor, reach: int, *, dim: int) -> None:
+def _scatter(compact: Lines, full: Lines, reach: int, *, axis: int) -> None:
     """Copy `compact` to its frequencies in `full`, zero the others."""
-    full.narrow(dim, 0, reach + 1).copy_(compact.narrow(dim, 0, reach + 1))
-    full.narrow(dim, reach + 1, full.shape[dim] - 2 * reach - 1).zero_()
-    if reach:
-        full.narrow(dim, full.shape[dim] - reach, reach).copy_(compact.narrow(dim, reach + 1, reach))
+    first, beyond, last = _bands(reach, full.shape[axis], axis)
+    from_first, _, from_last = _bands(reach, compact.shape[axis], axis)
+    full[first], full[last] = compact[from_first], compact[from_last]
+    full[beyond] = 0

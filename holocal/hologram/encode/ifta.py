@@ -8,9 +8,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 
+from holocal.hologram.encode.blocks import block_length, in_blocks, lines
 from holocal.hologram.encode.fourier import WindowedTransform
+
+
+_TINY = 1e-30
 
 
 @dataclass(frozen=True)
@@ -30,46 +35,80 @@ class Encoded:
 
 def unit_modulus(field: torch.Tensor) -> torch.Tensor:
     """Divide a complex field by its modulus in place, and return it; 0 stays 0."""
-    parts = torch.view_as_real(field)
-    square = torch.mul(parts[..., 0], parts[..., 0]).addcmul_(parts[..., 1], parts[..., 1])
-    parts.mul_(square.clamp_(min=1e-30).rsqrt_().unsqueeze(-1))
+    if field.device.type != "cpu":
+        parts = torch.view_as_real(field)
+        parts.div_(torch.linalg.vector_norm(parts, dim=-1, keepdim=True).clamp_(min=_TINY))
+        return field
+    values = field.numpy()
+    factor = np.abs(values)  # vectorised: 2.9 ms per 4K frame, torch's 36
+    np.maximum(factor, _TINY, out=factor)
+    np.divide(np.float32(1), factor, out=factor)
+    for part in (values.real, values.imag):
+        part *= factor
     return field
 
 
 def ifta(
-    start: torch.Tensor, wanted: torch.Tensor, window: torch.Tensor, transform: WindowedTransform, *, iterations: int
-) -> Encoded:
-    """Return the phase-only field whose spectrum in the window is nearest to the wanted one.
-
-    Each iteration adds to the field what its spectrum lacks in the window, which leaves the rest of the spectrum free,
-    and divides by the modulus. The wanted field's scale is the real factor that fits it best at each iteration.
-
-    Parameters
-    ----------
-    start
-        (rows, columns) complex64, the full-complex hologram divided by the reference; overwritten.
-    wanted, window
-        Compact spectra of `transform`: the wanted field, and where it is asked for (bool).
-    transform
-        To the window and back.
-    iterations
-        How many; 0 keeps the phase of `start`.
-    """
-    field, mask = unit_modulus(start), window.to(torch.float32).unsqueeze(-1)
-    wanted = wanted * window
-    power = max(_power(wanted), 1e-30)
+    start: torch.Tensor, wanted: torch.Tensor, window: torch.Tensor, transform: WindowedTransform, *, iterations: int,
+    relax: float = 1.0, beta: float = 0.0, floor: float = 0.0) -> Encoded:
+    field, target = start, _Target(wanted, window, floor)
+    height = block_length(field.shape[1], len(field), transform.device)
+    in_blocks(lambda part: unit_modulus(field[part]), len(field), height)
     errors, signal, inside = [], 0.0, 0.0
     found = transform.forward(field)
+    velocity = None
     for step in range(iterations + 1):
-        torch.view_as_real(found).mul_(mask)
-        scale = float(torch.vdot(wanted.flatten(), found.flatten()).real) / power
-        signal, inside = scale * scale * power, _power(found)
-        found.sub_(wanted, alpha=scale)
-        errors.append((_power(found) / max(signal, 1e-30)) ** 0.5)
+        scale, inside = target.fit(found)
+        signal = scale**2 * target.power
+        errors.append(max(inside / max(signal, 1e-30) - 1, 0.0) ** 0.5)
         if step < iterations:
-            found = transform.update(field, found, unit_modulus)
+            lack = target.lack(found, scale)
+            if beta:
+                velocity = lack*relax if velocity is None else velocity.mul_(beta).add_(lack, alpha=relax)
+                lack = velocity
+            elif relax != 1:
+                lack = lack * relax
+            found = transform.update(field, lack, unit_modulus)
     return Encoded(field, signal / field.numel(), inside / field.numel(), tuple(errors))
 
+class _Target:
+    def __init__(self, wanted, window, floor=0.0):
+        self.wanted = lines(wanted * window)
+        self.outside = lines(~window)
+        self.floor=floor
+        self.device = wanted.device.type
+        self.power = 0.0
+        self.power = max(self.sums(self.wanted, clear=False)[1], 1e-30)
 
-def _power(spectrum: torch.Tensor) -> float:
-    return float(torch.linalg.vector_norm(torch.view_as_real(spectrum))) ** 2
+    def sums(self, found, clear=True):
+        rows, columns = found.shape
+        sums = np.zeros((rows, 2))
+        def work(part):
+            f = found[part]
+            if clear:
+                f[self.outside[part]] = 0
+            w = self.wanted[part]
+            if isinstance(f, torch.Tensor):
+                f, w = (torch.view_as_real(x).flatten(1) for x in (f, w))
+                sums[part, 0] = torch.linalg.vecdot(w, f).cpu().numpy()
+                sums[part, 1] = torch.linalg.vecdot(f, f).cpu().numpy()
+            else:
+                f, w = f.view("f4"), w.view("f4")
+                sums[part, 0] = np.vecdot(w, f)
+                sums[part, 1] = np.vecdot(f, f)
+        in_blocks(work, rows, block_length(columns, rows, self.device))
+        return [float(x) for x in sums.sum(0)]
+
+    def fit(self, found):
+        cross, power = self.sums(lines(found))
+        s = cross / self.power
+        return max(s, self.floor * (power / self.power) ** 0.5), power
+
+    def lack(self, found, scale):
+        f = lines(found)
+        rows, columns = f.shape
+        def work(part):
+            f[part] *= -1
+            f[part] += self.wanted[part] * scale
+        in_blocks(work, rows, block_length(columns, rows, self.device))
+        return found
