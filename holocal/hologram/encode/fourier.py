@@ -17,6 +17,7 @@ import torch
 from holocal.hologram.encode.blocks import Lines, block_length, fft, in_blocks, lines
 from holocal.optics.bench import Array
 
+
 @dataclass
 class WindowedTransform:
     """The forward transform into a window, and its adjoint, for fields (rows, columns) complex64.
@@ -58,8 +59,13 @@ class WindowedTransform:
         fy = -np.r_[0 : ky + 1, -ky:0] / (self.rows * step_y_m)
         return fx, fy
 
-    def forward(self, data: torch.Tensor) -> torch.Tensor:
-        """Return the compact spectrum of a field; the field is kept."""
+    @property
+    def row_block(self) -> int:
+        """How many rows make a block (encode.blocks)."""
+        return block_length(self.columns, self.rows, self.device)
+
+    def forward(self, data: torch.Tensor, *, out: torch.Tensor | None = None) -> torch.Tensor:
+        """Return the compact spectrum of a field, in `out` if given; the field is kept."""
         rows = lines(data)
 
         def work(part: slice) -> None:
@@ -67,8 +73,8 @@ class WindowedTransform:
             block[:] = rows[part]
             self._rows_forward(block, part)
 
-        self._row_blocks(work)
-        return self._columns_forward()
+        in_blocks(work, self.rows, self.row_block)
+        return self._columns_forward(out)
 
     def adjoint(self, compact: torch.Tensor) -> torch.Tensor:
         """Return the field of a compact spectrum, zero outside it."""
@@ -79,15 +85,21 @@ class WindowedTransform:
             rows[part] = self._rows_inverse(part)
 
         self._columns_inverse(compact)
-        self._row_blocks(work)
+        in_blocks(work, self.rows, self.row_block)
         return out
 
     def update(
-        self, data: torch.Tensor, compact: torch.Tensor, constrain: Callable[[torch.Tensor], object]
+        self,
+        data: torch.Tensor,
+        compact: torch.Tensor,
+        constrain: Callable[[torch.Tensor], object],
+        *,
+        out: torch.Tensor | None = None,
     ) -> torch.Tensor:
         """Add the adjoint of `compact` to a field, constrain it row block by row block, return its new spectrum.
 
-        `data` is changed in place; `constrain` changes a block of rows in place, in whichever thread has it.
+        `data` is changed in place, the spectrum written to `out` if given; `constrain` changes a block of rows in
+        place, in whichever thread has it.
         """
         rows = lines(data)
 
@@ -99,8 +111,8 @@ class WindowedTransform:
             self._rows_forward(block, part)
 
         self._columns_inverse(compact)
-        self._row_blocks(work)
-        return self._columns_forward()
+        in_blocks(work, self.rows, self.row_block)
+        return self._columns_forward(out)
 
     def _rows_forward(self, block: Lines, part: slice) -> None:
         _gather(fft(block, axis=1), self._tall[part], self.reach_columns, axis=1)
@@ -111,8 +123,8 @@ class WindowedTransform:
         _scatter(tall, block, self.reach_columns, axis=1)
         return fft(block, axis=1, inverse=True)
 
-    def _columns_forward(self) -> torch.Tensor:
-        compact = self._empty(*self.shape)
+    def _columns_forward(self, compact: torch.Tensor | None = None) -> torch.Tensor:
+        compact = self._empty(*self.shape) if compact is None else compact
         out = lines(compact)
 
         def work(part: slice) -> None:
@@ -137,9 +149,6 @@ class WindowedTransform:
 
     def _empty(self, rows: int, columns: int) -> torch.Tensor:
         return torch.empty((rows, columns), dtype=torch.complex64, device=self.device)
-
-    def _row_blocks(self, work: Callable[[slice], None]) -> None:
-        in_blocks(work, self.rows, block_length(self.columns, self.rows, self.device))
 
     def _column_blocks(self, work: Callable[[slice], None]) -> None:
         in_blocks(work, self.shape[1], block_length(self.rows, self.shape[1], self.device))
