@@ -11,11 +11,12 @@ relaxation, momentum        0       5      10      20      50  efficiency after 
 =====================  ======  ======  ======  ======  ======  ===========================
 1, 0 (the thesis's)    0.333   0.128   0.079   0.046   0.023   0.532, 0.453
 1.8, 0                 0.333   0.084   0.048   0.029   0.015   0.494, 0.435
-1.8, 0.2               0.333   0.066   0.039   0.025   0.014   0.480, 0.429
+1.8, 0.2               0.333   0.066   0.039   0.024   0.013   0.480, 0.428
 =====================  ======  ======  ======  ======  ======  ===========================
 
-The light that is left depends on the error that is reached, hardly on the way there: 0.495 against 0.498 at 0.05, after
-8 iterations instead of 18.
+The light that is left depends on the error that is reached, hardly on the way there: 0.495 against 0.498 at an error of
+0.05, after 8 iterations instead of 18. At 3840 x 2160, 10 iterations leave 0.036 instead of 0.076. Rounding to 256
+levels adds 0.004, in quadrature.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from holocal.hologram.encode.fourier import WindowedTransform
 from holocal.optics.bench import Array
 
 _TINY = 1e-30
-_RELAXATION, _MOMENTUM = 1.8, 0.2  # 2 and 0 oscillate, momentum 0.4 loses 0.1 of the light in 10 iterations
+_RELAXATION, _MOMENTUM = 1.8, 0.2  # 2 and 0 oscillate; a momentum of 0.3 costs 1.4 % of the light at an error of 0.05
 _CROWDED = 0.5  # of the band; a wider window leaves too little freedom to go too far: at 0.7, 1.8 is worse than 1
 _UNRELATED = 1.0  # a start that leaves more error than signal costs light for good: 0.1 instead of 0.49
 
@@ -97,8 +98,9 @@ def ifta(
     iterations
         At most; 0 keeps the phase of `start`.
     gain
-        Stop when an iteration takes off less than this share of the error. The first is not judged: on few bright
-        points it may cost error that the next win back.
+        Stop when an iteration takes off less than this share of the error. At 0.02 a photograph stops after 34
+        iterations with an error of 0.017, where 10 more would take off a sixth of it; a window over the whole band
+        after 2. The first is not judged: on few bright points it may cost error that the next win back.
     """
     target = _Target.of(wanted, window)
     _each_row(start, transform)
