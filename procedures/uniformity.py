@@ -93,6 +93,7 @@ def refine_frames(block_noise: float) -> int:
 def frame_levels(weights: NDArray[np.floating[Any]], state: State, step: int, shot: int) -> NDArray[np.uint8]:
     """Return the levels that show an image of these intensities with the initial phase of (seed, step, shot)."""
     from holocal.hologram.pipeline import HologramSettings, render_image
+    from holocal.hologram.settings import Warped, Zones
     from holocal.optics.bench import Bench, Panel
 
     facts, chosen = state.facts, state.parameters
@@ -101,8 +102,7 @@ def frame_levels(weights: NDArray[np.floating[Any]], state: State, step: int, sh
         bench=Bench.nominal(pupil_diameter_m=facts.pupil_diameter_m, eye_relief_m=facts.eye_relief_m),
         wavelength_m=chosen.wavelength_nm * 1e-9,
         fov_rad=facts.camera.field_rad,
-        zones=chosen.zones or 5,
-        warped=chosen.zones is None,
+        method=Warped() if chosen.zones is None else Zones(chosen.zones),
         iterations=chosen.iterations,
         device=chosen.device,
     )

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from holocal.hologram.pipeline import render_image
-from holocal.hologram.settings import HologramSettings
+from holocal.hologram.settings import HologramSettings, Warped, Zones
 from holocal.optics.bench import Bench, Panel
 from holocal.records.rig import load_rig
 from rigs.simulated import open_rig
@@ -105,9 +105,9 @@ def main() -> None:
     """Render, photograph, measure, draw."""
     image = text_image()
     choices = {
-        "1 zone (thesis's method)": settings(warped=False, zones=1),
-        "2 x 2 zones (thesis's method)": settings(warped=False, zones=2),
-        "warped patches (holocal's default)": settings(warped=True),
+        "1 zone (thesis's method)": settings(method=Zones(1)),
+        "2 x 2 zones (thesis's method)": settings(method=Zones(2)),
+        "warped patches (holocal's default)": settings(method=Warped()),
     }
     rig = open_rig(load_rig("simulated-ideal"))
     rig.light.select(WAVELENGTH_M)

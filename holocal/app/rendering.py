@@ -14,6 +14,7 @@ from holocal.app import session
 from holocal.app.corrections import corrected
 from holocal.errors import InputError, UsageError
 from holocal.hologram.pipeline import HologramSettings, render_image
+from holocal.hologram.settings import Warped, Zones
 from holocal.optics.bench import Bench, Panel
 from holocal.records.files import storage_error
 from holocal.records.frames import PACKINGS, write_frame
@@ -98,8 +99,7 @@ def render(config: RigConfig, asked: Request, outputs: Outputs) -> dict[str, Any
         fov_rad=fov_rad,
         gaze_rad=gaze_rad,
         depth_m=asked.depth_m,
-        zones=asked.zones or 5,
-        warped=asked.zones is None,
+        method=Warped() if asked.zones is None else Zones(asked.zones),
         iterations=asked.iterations,
         device=config.device,
     )

@@ -5,7 +5,26 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from holocal.hologram.scenes.points import Aperture
 from holocal.optics.bench import Array
+
+EDGE_M = 0.2e-3  # width of the footprint's soft edge, in the pupil; half way at the rim (decision 0004)
+
+
+def transmission(pupil_m: Array, diameter_m: float, aperture: Aperture | None = None) -> Array:
+    """Return A (...) in [0, 1] of the footprint at pupil points (..., 2): 1 inside, half at the rim, a cosine between.
+
+    Within the pupil, and within `aperture` where one is given.
+    """
+    inside = _soft_disc(np.hypot(pupil_m[..., 0], pupil_m[..., 1]), diameter_m / 2)
+    if aperture is None:
+        return inside
+    away = pupil_m - np.asarray(aperture.centre_m)
+    return inside * _soft_disc(np.hypot(away[..., 0], away[..., 1]), aperture.diameter_m / 2)
+
+
+def _soft_disc(radius_m: Array, rim_m: float) -> Array:
+    return np.asarray(0.5 - 0.5 * np.sin(np.pi * np.clip((radius_m - rim_m) / EDGE_M, -0.5, 0.5)))
 
 
 def row_spans(rim_m: Array, y_m: Array) -> tuple[Array, Array]:

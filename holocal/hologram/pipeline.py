@@ -1,30 +1,32 @@
-"""Scene to frame, the thesis's pipeline (figure 3.2): points, zones, full-complex hologram, IFTA, levels.
+"""Scene to frame, the thesis's pipeline (figure 3.2): points, full-complex hologram, phase-only encoding, levels.
 
 Pure: the same inputs give the same bytes.
 """
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
+from holocal.hologram.clock import Clock
+from holocal.hologram.encode.encoder import Encoder, Target
 from holocal.hologram.encode.fourier import WindowedTransform
-from holocal.hologram.encode.ifta import Encoded, ifta
+from holocal.hologram.encode.ifta_encoder import Ifta
 from holocal.hologram.frame import panel_phase, phase_to_levels
-from holocal.hologram.grid import Grid, panel_grid, resample_compact, synthesis_grid
-from holocal.hologram.scenes.image import InitialPhase, PointGrid, RandomPhase, image_points
+from holocal.hologram.reference import PupilWindow, pupil_window, reference_turns
+from holocal.hologram.scenes.image import InitialPhase, RandomPhase, image_cloud
+from holocal.hologram.scenes.points import PointCloud
+from holocal.hologram.series import Series
 from holocal.hologram.settings import HologramSettings
+from holocal.hologram.stored import Store
 from holocal.hologram.synthesis import synthesise
-from holocal.hologram.zones import ZonePlan, zone_plan
-from holocal.optics.bench import Panel
 
-__all__ = ["HologramSettings", "Rendered", "render_image", "render_images"]
+__all__ = ["HologramSettings", "Rendered", "render", "render_image", "render_images"]
 
 _BLOCK = 128  # rows at a time: float64 work that stays in the cache
 _MARGIN_BINS = 2.0  # the window is this much wider than the pupil's image: half a pixel of the footprint's edge
@@ -37,7 +39,8 @@ class Rendered:
     `levels` (H, W) uint8 for the panel; `phase_rad` (H, W) float32 in [0, 2 pi), before quantisation; `field` (H, W)
     complex64, the full-complex hologram before the linear phase and the encoding, or None; `seconds` per stage;
     `skipped` a sentence for each thing left out; `efficiency` the share of the panel's light that is wanted signal in
-    the pupil; `signal_error` after each IFTA iteration.
+    the pupil; `signal_error` after each iteration of the encoder; `encoded` the field of unit modulus, divided by the
+    reference, a warm start for the next frame, or None.
     """
 
     levels: NDArray[np.uint8]
@@ -47,6 +50,71 @@ class Rendered:
     skipped: list[str]
     efficiency: float
     signal_error: tuple[float, ...] = ()
+    encoded: torch.Tensor | None = None
+
+
+def render(
+    clouds: Sequence[PointCloud],
+    settings: HologramSettings,
+    *,
+    encoder: Encoder | None = None,
+    keep_complex: bool = False,
+    keep_encoded: bool = False,
+    response_rad: ArrayLike | None = None,
+    store: Store | None = None,
+) -> Rendered:
+    """Return the frame that shows clouds of points: the one way from any scene to the panel.
+
+    Parameters
+    ----------
+    clouds
+        The scene (`holocal.hologram.scenes`), coherent; one colour.
+    settings
+        Panel, bench, colour, field, method.
+    encoder
+        To phase only; the default is IFTA with the settings' iterations.
+    keep_complex, keep_encoded
+        Keep the full-complex hologram (66 MB at 4K), and the encoded field for the next frame's start.
+    response_rad
+        (256,) phase of each level; default 2 pi L / 256.
+    store
+        Keeps phase functions between programs.
+    """
+    clock = Clock.start()
+    transform, reference = _transform(settings), _reference(settings)
+    clock.lap("table")
+    reach = (transform.reach_rows, transform.reach_columns)
+    found = synthesise(clouds, settings, reach=reach, clock=clock, store=store)
+    dark = sum(int(np.count_nonzero(cloud.amplitude == 0)) for cloud in clouds)
+    count = sum(len(cloud) for cloud in clouds)
+    skipped = [f"{dark} of {count} points: dark"] if dark else []
+    if found is None:
+        return _dark_frame(settings, clock, skipped, keep_complex)
+    skipped += found.skipped
+    if settings.wavefront is not None and settings.wavefront.is_identity():
+        skipped.append("the wavefront correction: it changes nothing")
+    complex_field = _undivided(found.field, reference, settings) if keep_complex else None
+    clock.lap("complex field")
+    window = torch.from_numpy(_window_mask(settings)).to(settings.device)
+    target = Target(found.field, transform.forward(found.field), window, transform)
+    clock.lap("to pupil")
+    encoded = (encoder or Ifta(settings.iterations))(target)
+    clock.lap("encode")
+    phase = panel_phase(encoded.field, reference, settings.panel)
+    levels = phase_to_levels(phase, response_rad)
+    clock.lap("levels")
+    if encoded.stopped:
+        skipped.append(encoded.stopped)
+    return Rendered(
+        levels,
+        phase,
+        complex_field,
+        clock.seconds,
+        skipped,
+        encoded.efficiency,
+        encoded.signal_error,
+        encoded.field if keep_encoded else None,
+    )
 
 
 def render_image(
@@ -54,30 +122,27 @@ def render_image(
     settings: HologramSettings,
     *,
     seed: int,
+    encoder: Encoder | None = None,
     keep_complex: bool = False,
     response_rad: ArrayLike | None = None,
     initial_phase: InitialPhase | None = None,
 ) -> Rendered:
-    """Return the frame that shows an image.
+    """Return the frame that shows an image at the settings' depth.
 
     Parameters
     ----------
     intensity
         (rows, columns), not negative; row 0 on top. Covers `settings.fov_rad`, centred on the gaze.
-    settings
-        Panel, bench, colour, field, zones, iterations.
     seed
         Of the random initial phase.
-    keep_complex
-        Keep the full-complex hologram too (66 MB at 4K).
-    response_rad
-        (256,) phase of each level; default 2 pi L / 256.
     initial_phase
         Another choice of the points' initial phase than `RandomPhase(seed)`.
+    settings, encoder, keep_complex, response_rad
+        As in `render`.
     """
     choice = initial_phase or RandomPhase(seed)
-    scene = image_points(intensity, fov_rad=settings.fov_rad, initial_phase=choice)
-    return _render([scene], settings, keep_complex=keep_complex, response_rad=response_rad)[0]
+    cloud = image_cloud(intensity, fov_rad=settings.fov_rad, depth_m=settings.depth_m, initial_phase=choice)
+    return render([cloud], settings, encoder=encoder, keep_complex=keep_complex, response_rad=response_rad)
 
 
 def render_images(
@@ -88,69 +153,50 @@ def render_images(
     keep_complex: bool = False,
     response_rad: ArrayLike | None = None,
 ) -> list[Rendered]:
-    """Return one frame per seed of the same image, as `render_image` would; the zones' factors are made once."""
-    scenes = [image_points(intensity, fov_rad=settings.fov_rad, initial_phase=RandomPhase(seed)) for seed in seeds]
-    return _render(scenes, settings, keep_complex=keep_complex, response_rad=response_rad)
-
-
-def _render(
-    scenes: list[PointGrid], settings: HologramSettings, *, keep_complex: bool, response_rad: ArrayLike | None
-) -> list[Rendered]:
-    clock = Clock.start()
-    plan = zone_plan(settings)
-    clock.lap("table")
-    if not plan.zones or not any(scene.amplitude.any() for scene in scenes):
-        return [_dark_frame(plan, settings, clock, keep_complex) for _ in scenes]
-    grid = synthesis_grid(plan, settings.panel)
-    holograms, skipped = synthesise(plan, grid, scenes, device=settings.device)
-    clock.lap("synthesis")
+    """Return one frame per seed of the same image, as `render_image` would."""
     return [
-        _frame(one, plan, grid, settings, skipped, clock.fork(len(scenes)), keep_complex, response_rad)
-        for one in holograms
+        render_image(intensity, settings, seed=seed, keep_complex=keep_complex, response_rad=response_rad)
+        for seed in seeds
     ]
 
 
-def _frame(
-    hologram: torch.Tensor,
-    plan: ZonePlan,
-    grid: Grid,
-    settings: HologramSettings,
-    skipped: list[str],
-    clock: Clock,
-    keep_complex: bool,
-    response_rad: ArrayLike | None,
-) -> Rendered:
-    """Encode one hologram that is divided by the reference and sampled on `grid`."""
-    panel = settings.panel
-    transform = _transform(settings)
-    window = torch.from_numpy(_window_mask(settings)).to(settings.device)
-    wanted = _spectrum(hologram, transform, grid, panel)
-    start = transform.adjoint(wanted)
-    clock.lap("to panel")
-    complex_field = _undivided(hologram, plan, grid, settings) if keep_complex else None
-    clock.lap("complex field")
-    encoded: Encoded = ifta(start, wanted, window, transform, iterations=settings.iterations)
-    clock.lap("ifta")
-    phase = panel_phase(encoded.field, plan.reference_turns, panel)
-    levels = phase_to_levels(phase, response_rad)
-    clock.lap("levels")
-    return Rendered(
-        levels, phase, complex_field, clock.seconds, list(skipped), encoded.efficiency, encoded.signal_error
-    )
+def _where(settings: HologramSettings) -> HologramSettings:
+    """Return settings that agree in all that the window and the reference depend on."""
+    plain = HologramSettings(settings.panel, settings.bench, settings.wavelength_m, (0.1, 0.1), settings.gaze_rad)
+    return replace(plain, device=settings.device)
+
+
+@lru_cache(maxsize=4)
+def _window(where: HologramSettings) -> PupilWindow:
+    return pupil_window(where)
+
+
+def _reference(settings: HologramSettings) -> Series:
+    return _reference_at(_where(settings))
+
+
+@lru_cache(maxsize=4)
+def _reference_at(where: HologramSettings) -> Series:
+    return reference_turns(where)
+
+
+def _window_mask(settings: HologramSettings) -> NDArray[np.bool_]:
+    """Return which bins of the compact spectrum lie in the pupil's image."""
+    return _mask_at(_where(settings))
 
 
 @lru_cache(maxsize=2)
-def _window_mask(settings: HologramSettings) -> NDArray[np.bool_]:
-    """Return which bins of the compact spectrum lie in the pupil's image."""
-    window, panel = zone_plan(settings).window, settings.panel
-    transform, margin = _transform(settings), _MARGIN_BINS / (min(panel.width, panel.height) * panel.pitch_m)
-    return window.contains(*transform.frequencies(panel.pitch_m, panel.pitch_m), margin_per_m=margin)
+def _mask_at(where: HologramSettings) -> NDArray[np.bool_]:
+    panel = where.panel
+    margin = _MARGIN_BINS / (min(panel.width, panel.height) * panel.pitch_m)
+    frequencies = _transform(where).frequencies(panel.pitch_m, panel.pitch_m)
+    return _window(where).contains(*frequencies, margin_per_m=margin)
 
 
 def _transform(settings: HologramSettings) -> WindowedTransform:
     """Return the transform between the panel's pixels and the bins round the pupil's image."""
     panel = settings.panel
-    reach_x, reach_y = zone_plan(settings).window.half_size_per_m
+    reach_x, reach_y = _window(_where(settings)).half_size_per_m
     return WindowedTransform(
         panel.height,
         panel.width,
@@ -160,62 +206,28 @@ def _transform(settings: HologramSettings) -> WindowedTransform:
     )
 
 
-def _spectrum(hologram: torch.Tensor, transform: WindowedTransform, grid: Grid, panel: Panel) -> torch.Tensor:
-    """Return the compact spectrum, on the panel's pixels, of a hologram sampled on `grid`."""
-    reach = (transform.reach_rows, transform.reach_columns)
-    coarse = WindowedTransform(grid.rows, grid.columns, *reach, transform.device)
-    return resample_compact(coarse.forward(hologram), reach, grid, panel_grid(panel))
-
-
-def _undivided(hologram: torch.Tensor, plan: ZonePlan, grid: Grid, settings: HologramSettings) -> NDArray[np.complex64]:
+def _undivided(hologram: torch.Tensor, reference: Series, settings: HologramSettings) -> NDArray[np.complex64]:
     """Return the full-complex hologram on the panel's pixels, with the reference put back."""
     panel = settings.panel
-    if grid != panel_grid(panel):
-        reach = ((grid.rows - 1) // 2, (grid.columns - 1) // 2)
-        transform = WindowedTransform(panel.height, panel.width, *reach, settings.device)
-        hologram = transform.adjoint(_spectrum(hologram, transform, grid, panel))
-    else:
-        hologram = hologram.clone()
+    hologram = hologram.clone()
     for top in range(0, panel.height, _BLOCK):
         part = slice(top, top + _BLOCK)
-        turns = torch.from_numpy(plan.reference_turns.on_grid(panel.x_m, panel.y_m[part]))
+        turns = torch.from_numpy(reference.on_grid(panel.x_m, panel.y_m[part]))
         turns.sub_(torch.round(turns)).mul_(2 * np.pi)
         phase = turns.to(torch.float32)
         hologram[part].mul_(torch.polar(torch.ones_like(phase), phase).to(hologram.device))
     return np.asarray(hologram.cpu().numpy())
 
 
-def _dark_frame(plan: ZonePlan, settings: HologramSettings, clock: Clock, keep_complex: bool) -> Rendered:
+def _dark_frame(settings: HologramSettings, clock: Clock, skipped: list[str], keep_complex: bool) -> Rendered:
     """Return the frame that shows nothing: the uniform panel sends all light to its zero order, outside the pupil."""
     shape = (settings.panel.height, settings.panel.width)
+    clock.lap("levels")
     return Rendered(
         np.zeros(shape, np.uint8),
         np.zeros(shape, np.float32),
         np.zeros(shape, np.complex64) if keep_complex else None,
-        dict(clock.seconds),
-        [*plan.left_out(), "nothing in the image is on the panel and bright: the frame is uniform"],
+        clock.seconds,
+        [*skipped, "nothing in the scene is on the panel and bright: the frame is uniform"],
         0.0,
     )
-
-
-@dataclass
-class Clock:
-    """Seconds per stage."""
-
-    seconds: dict[str, float]
-    last: float
-
-    @classmethod
-    def start(cls) -> Clock:
-        """Return a clock that has just begun."""
-        return cls({}, time.perf_counter())
-
-    def lap(self, stage: str) -> None:
-        """Book the time since the last lap."""
-        now = time.perf_counter()
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self.last
-        self.last = now
-
-    def fork(self, shares: int) -> Clock:
-        """Return a clock for one of several frames that share the time booked so far."""
-        return Clock({stage: spent / shares for stage, spent in self.seconds.items()}, time.perf_counter())

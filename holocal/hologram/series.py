@@ -33,6 +33,11 @@ class Series:
         in_y, in_x = self.bases(x, y)
         return np.asarray(np.einsum("yi,ij...,xj->yx...", in_y, self.coefficients, in_x, optimize=True))
 
+    def at(self, points: Array) -> Array:
+        """Return the values, (n, ...), at scattered points (n, 2)."""
+        in_y, in_x = self.bases(points[:, 0], points[:, 1])
+        return np.asarray(np.einsum("ni,nj,ij...->n...", in_y, in_x, self.coefficients, optimize=True))
+
     def __add__(self, other: Series) -> Series:
         size = np.maximum(self.coefficients.shape, other.coefficients.shape)
         total = np.zeros(tuple(size))

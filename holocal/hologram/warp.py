@@ -1,9 +1,10 @@
 """Phase functions of a patch of the panel as a bilinear form in warped coordinates (docs/physics.md 4).
 
-    phi_p(x) = a(x) + b(p) + u(p) . g(x)
+    phi_p(x) - psi0(x) = a(s) + b(p) + u(p) . g(s),        s = s(x)
 
-with g a smooth warp of the panel, close to x itself, and u the tilt. A thesis zone shares one wavefront up to tilt,
-g = x, and leaves 1.55 rad rms in 5 x 5 zones; the warp lets the wavefront change over the field and leaves 0.03.
+with psi0 the reference, g a smooth warp of the sight coordinates, close to s itself, and u the place in the pupil. A
+thesis zone shares one wavefront up to tilt, g = x, and leaves 1.55 rad rms in 5 x 5 zones; the warp lets the wavefront
+change over the field and leaves 0.03.
 """
 
 from __future__ import annotations
@@ -13,133 +14,134 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.polynomial import chebyshev
 
+from holocal.hologram.phase_model import wanted_phase
 from holocal.hologram.series import Series, fit_series
 from holocal.hologram.settings import HologramSettings
+from holocal.hologram.sight import Sight
 from holocal.optics.bench import Array
-from holocal.optics.phase_function import VirtualPoints, exact_phase, pupil_rim
-from holocal.optics.raytrace import connect
+from holocal.optics.phase_function import VirtualPoints
 
 FIELD_NODES, PANEL_NODES = 9, 13
 PANEL_DEGREE = 5  # total, of a and g: degree 4 leaves twice the error
-MOST_ROUNDS, SETTLED = 400, 3e-3  # alternating least squares from g = x ends when a round gains less than this share
+MOST_ROUNDS, SETTLED = 400, 3e-3  # alternating least squares from g = s ends when a round gains less than this share
 RIM = 0.05  # width of the soft edge of the weights, of the pupil's radius
 OUTSIDE = 1e-9  # weight of rays that miss the pupil: they only keep the fit from running wild
+Bounds = tuple[tuple[float, float], tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class Depth:
+    """Where points lie: on a sphere about the pupil's centre, or on a plane across the gaze (`flat`).
+
+    `inverse_m` is the inverse of its distance along the gaze, 1 / m (dioptres); 0 is infinitely far.
+    """
+
+    inverse_m: float
+    flat: bool = False
+
+    def points(self, field_tan: Array) -> VirtualPoints:
+        """Return the virtual points at tangents (..., 2)."""
+        if self.inverse_m == 0:
+            return VirtualPoints.at(field_tan)
+        distance = 1 / self.inverse_m * np.ones(field_tan.shape[:-1])
+        if self.flat:
+            distance = distance * np.sqrt(1 + np.sum(field_tan**2, axis=-1))
+        return VirtualPoints.at(field_tan, distance)
 
 
 @dataclass(frozen=True)
 class Box:
-    """A rectangle of the panel: `centre` and `half`, (2,) metres."""
+    """A rectangle of sight coordinates: `centre` and `half`, (2,)."""
 
     centre: Array
     half: Array
 
-    def basis(self, slm_m: Array) -> Array:
-        """Return Chebyshev products of total degree up to `PANEL_DEGREE` at panel points, (k, terms)."""
-        local = (slm_m - self.centre) / self.half
+    def basis(self, s: Array) -> Array:
+        """Return Chebyshev products of total degree up to `PANEL_DEGREE` at points (k, 2), (k, terms)."""
+        local = (s - self.centre) / self.half
         in_x, in_y = (chebyshev.chebvander(local[:, axis], PANEL_DEGREE) for axis in (0, 1))
         pairs = [(i, j) for i in range(PANEL_DEGREE + 1) for j in range(PANEL_DEGREE + 1 - i)]
         return np.stack([in_x[:, i] * in_y[:, j] for i, j in pairs], axis=-1)
 
+    def series(self, coefficients: Array) -> Series:
+        """Return the polynomial with these coefficients (terms, ...) as a series over the box."""
+        return fit_series(
+            lambda at: self.basis(at) @ coefficients,
+            degree=PANEL_DEGREE,
+            centre=(float(self.centre[0]), float(self.centre[1])),
+            half=(float(self.half[0]), float(self.half[1])),
+        )
+
 
 @dataclass(frozen=True)
 class Warp:
-    """The bilinear form of a part of the panel and a part of the field.
+    """The bilinear form of a patch of the panel and the field that it shows.
 
     Parameters
     ----------
     phase_rad
-        a(x), over the panel.
-    coordinate_m
-        g(x) with two values, metres, over the panel.
+        a(s), over the patch.
+    coordinate
+        g(s) with two values, over the patch.
     field
-        Over the field's part, three values: u (radians per metre) and b (radians).
-    residual_rad
-        Rms of what the form leaves of the phase, over rays through the pupil from the panel.
+        Over the field's part, three values: u (radians per unit of g) and b (radians).
+    square_rad2, weight
+        Weighted sum of squares of what the form leaves of the phase, over rays through the pupil, and of the weights.
     """
 
     phase_rad: Series
-    coordinate_m: Series
+    coordinate: Series
     field: Series
-    residual_rad: float
+    square_rad2: float
+    weight: float
 
 
-def fit_warp(
-    settings: HologramSettings,
-    bounds: tuple[tuple[float, float], tuple[float, float]],
-    outline_m: Array,
-    pivot_m: Array,
-) -> Warp:
-    """Return the bilinear form of a part of the panel and a part of the field.
+def fit_warp(settings: HologramSettings, sight: Sight, depth: Depth, bounds: Bounds, box: Box) -> Warp:
+    """Return the bilinear form of a patch of the panel and a part of the field.
 
     Alternating least squares over traced pairs (point, panel point). `bounds` are the tangents ((x low, x high),
-    (y low, y high)), `outline_m` (n, 2) corners of the panel's part.
+    (y low, y high)) of the field's part.
     """
     centre = (sum(bounds[0]) / 2, sum(bounds[1]) / 2)
     half = ((bounds[0][1] - bounds[0][0]) / 2, (bounds[1][1] - bounds[1][0]) / 2)
-    panel_half = settings.panel.half_size_m
-    low = np.maximum(outline_m.min(axis=0), np.negative(panel_half))
-    high = np.minimum(outline_m.max(axis=0), panel_half)
     t = np.linspace(-1, 1, PANEL_NODES)
-    slm = np.stack(np.meshgrid(*((low[i] + high[i]) / 2 + t * (high[i] - low[i]) / 2 for i in (0, 1))), axis=-1)
-    slm = slm.reshape(-1, 2)
+    s = np.stack(np.meshgrid(t * box.half[0], t * box.half[1]), axis=-1).reshape(-1, 2) + box.centre
     node = np.cos(np.pi * (np.arange(FIELD_NODES) + 0.5) / FIELD_NODES)
     tangents = np.stack(np.meshgrid(centre[0] + node * half[0], centre[1] + node * half[1]), axis=-1).reshape(-1, 2)
-    phase, weight = _phases(settings, tangents, slm)
+    phase, weight = _phases(settings, sight, depth.points(tangents[:, None]), s)
     piston = float(phase.mean())
     phase = phase - piston
-    box = Box((low + high) / 2, (high - low) / 2)
-    basis = box.basis(slm)
-    g = slm - pivot_m
+    basis = box.basis(s)
+    g = s - box.centre
     scale = float(np.abs(g).max())
-    residual = np.inf
+    square = np.inf
     ub = _field_step(phase, weight, g / scale)
     for _ in range(MOST_ROUNDS):
         coefficients = _panel_step(phase - ub[:, 2:], weight, ub[:, :2], basis)
         a, g = basis @ coefficients[:, 0], scale * (basis @ coefficients[:, 1:])
         ub = _field_step(phase - a, weight, g / scale)
         rest = phase - a - ub[:, 2:] - (ub[:, :2] / scale) @ g.T
-        before, residual = residual, float(np.sqrt(np.sum(weight * rest**2) / np.sum(weight)))
-        if residual > (1 - SETTLED) * before:
+        before, square = square, float(np.sum(weight * rest**2))
+        if square > (1 - SETTLED) ** 2 * before:
             break
     values = np.concatenate([ub[:, :2] / scale, ub[:, 2:] + piston], axis=1)
     field = fit_series(lambda _: values, degree=FIELD_NODES - 1, centre=centre, half=half)
-    coefficients[:, 1:] *= scale
-
-    def over_panel(columns: slice) -> Series:  # the same polynomial, over the whole panel: exact at this degree
-        return fit_series(
-            lambda at: box.basis(at) @ coefficients[:, columns], degree=PANEL_DEGREE, centre=(0.0, 0.0), half=panel_half
-        )
-
-    phase_series = over_panel(slice(0, 1))
-    phase_series = Series(phase_series.coefficients[..., 0], phase_series.centre, phase_series.half)
-    return Warp(phase_series, over_panel(slice(1, 3)), field, residual)
-
-
-def visible_field(settings: HologramSettings, outline_m: Array) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the tangents (x low, high), (y low, high) of what a part of the panel shows through the pupil.
-
-    With a margin of 15 % of the pupil, for a bench that is not quite where it should be.
-    """
-    rim = pupil_rim(settings.bench.pupil_diameter_m * 1.15, 32)
-    seen = connect(settings.bench, outline_m[:, None], rim, gaze_rad=settings.gaze_rad).field_tan.reshape(-1, 2)
-    nearer = 0.0 if np.isinf(settings.depth_m) else settings.bench.pupil_diameter_m / settings.depth_m
-    low, high = seen.min(axis=0) - nearer, seen.max(axis=0) + nearer
-    return (float(low[0]), float(high[0])), (float(low[1]), float(high[1]))
-
-
-def _phases(settings: HologramSettings, tangents: Array, slm_m: Array) -> tuple[Array, Array]:
-    """Return exact phases (points, panel points), piston removed, and weights by where the rays cross the pupil."""
-    found = exact_phase(
-        settings.bench,
-        VirtualPoints.at(tangents[:, None], settings.depth_m),
-        slm_m,
-        wavelength_m=settings.wavelength_m,
-        gaze_rad=settings.gaze_rad,
-        steps=5,
+    return Warp(
+        box.series(coefficients[:, 0]),
+        box.series(coefficients[:, 1:] * scale),
+        field,
+        square,
+        float(np.sum(weight)),
     )
-    radius = np.linalg.norm(found.pupil_m, axis=-1) / (settings.bench.pupil_diameter_m / 2)
+
+
+def _phases(settings: HologramSettings, sight: Sight, points: VirtualPoints, s: Array) -> tuple[Array, Array]:
+    """Return phases (points, s) less the reference's, and weights by where the rays cross the pupil."""
+    slm = sight.panel(s)
+    found = wanted_phase(settings, points, slm, steps=5)
+    radius = np.linalg.norm(found.pupil_m, axis=-1) / sight.pupil_radius_m
     weight = OUTSIDE + 1 / (1 + np.exp(np.clip((radius - 1) / RIM, -50, 50)))
-    return found.phase_rad, weight
+    return found.phase_rad - sight.reference_rad(s), weight
 
 
 def _field_step(phase: Array, weight: Array, g: Array) -> Array:

@@ -12,8 +12,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from holocal.hologram.settings import HologramSettings
-from holocal.hologram.zones import zone_borders
+from holocal.hologram.settings import HologramSettings, Zones
+from holocal.hologram.zones import zone_borders, zone_count
 from holocal.optics.bench import Array, Bench, Panel, image_tangents
 from holocal.optics.phase_function import VirtualPoints, exact_phase
 
@@ -32,7 +32,7 @@ def zone_wavefront_error(settings: HologramSettings, *, samples: int = 35) -> fl
     settings
         Bench, panel, wavelength, field and zones; the rest does not matter.
     """
-    return zone_wavefront_errors(settings, [settings.zones], samples=samples)[0]
+    return zone_wavefront_errors(settings, [zone_count(settings)], samples=samples)[0]
 
 
 def zone_wavefront_errors(settings: HologramSettings, zones: Sequence[int], *, samples: int = 35) -> list[float]:
@@ -41,7 +41,7 @@ def zone_wavefront_errors(settings: HologramSettings, zones: Sequence[int], *, s
     x, y = np.linspace(-half_x, half_x, _PANEL_SAMPLES[0]), np.linspace(half_y, -half_y, _PANEL_SAMPLES[1])
     slm = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     points = np.stack(np.meshgrid(*image_tangents(samples, samples, settings.fov_rad)), axis=-1).reshape(-1, 2)
-    shared = [_shared_phase(replace(settings, zones=count), points, slm) for count in zones]
+    shared = [_shared_phase(replace(settings, method=Zones(count)), points, slm) for count in zones]
     squares: list[list[Array]] = [[] for _ in zones]
     for part in np.array_split(np.arange(len(points)), max(1, len(points) // 100)):
         own, inside = _phase(settings, points[part], slm)
@@ -54,12 +54,12 @@ def _shared_phase(settings: HologramSettings, points: Array, slm_m: Array) -> tu
     """Return the phases of the zones' centres at panel points, (zones^2, k), and each point's zone, (n,)."""
     borders = zone_borders(settings)
     column, row = (
-        np.clip(np.searchsorted(border, points[:, axis], side="right") - 1, 0, settings.zones - 1)
+        np.clip(np.searchsorted(border, points[:, axis], side="right") - 1, 0, zone_count(settings) - 1)
         for axis, border in enumerate(borders)
     )
     middle_x, middle_y = ((border[1:] + border[:-1]) / 2 for border in borders)
     centres = np.stack(np.meshgrid(middle_x, middle_y), axis=-1).reshape(-1, 2)
-    return _phase(settings, centres, slm_m)[0], row * settings.zones + column
+    return _phase(settings, centres, slm_m)[0], row * zone_count(settings) + column
 
 
 def best_tilt_residual(phase_rad: Array, slm_m: Array, inside: Array) -> Array:

@@ -17,12 +17,10 @@ from scipy.spatial import ConvexHull
 from holocal.hologram.footprint import sample_footprint
 from holocal.hologram.reference import PupilWindow, pupil_window, reference_turns
 from holocal.hologram.series import Series, fit_series
-from holocal.hologram.settings import HologramSettings
-from holocal.hologram.warp import fit_warp, visible_field
+from holocal.hologram.settings import HologramSettings, Zones
 from holocal.optics.bench import Array
 from holocal.optics.phase_function import PhaseFunctions, VirtualPoints, phase_functions, pupil_rim, trace_points
 
-PATCH_M = (3.6e-3, 4.04e-3)  # widest warped patch: 4 x 2 on the 4K panel, which leaves 0.05 rad rms
 OUTLINE_MARGIN = 1.15  # of the pupil: a mirror turned by 0.3 degrees moves the footprints by a tenth of their width
 _CORNERS = 6  # grid lines of corners across the field when the zones themselves have fewer
 
@@ -48,8 +46,6 @@ class Zone:
         Largest |frequency| along (x, y) of the zone's light after division by the reference.
     bounds
         Tangents ((x low, x high), (y low, y high)) of the points it shows.
-    warp
-        Warped coordinates of the panel, metres, two values; None where they are x - `pivot_m`.
     """
 
     row: int
@@ -60,7 +56,6 @@ class Zone:
     rim_m: Array
     band_per_m: tuple[float, float]
     bounds: tuple[tuple[float, float], tuple[float, float]]
-    warp: Series | None = None
 
 
 @dataclass(frozen=True)
@@ -68,8 +63,7 @@ class ZonePlan:
     """All that synthesis needs for one setting; small arrays only.
 
     `edges_x`, `edges_y` (zones + 1) ascending tangents of the zones' borders; `zones` those whose footprint meets the
-    panel; `missing` the (row, column) of the others; `traced` how many virtual points were traced. With `warped`, the
-    zones are patches of the panel, and the missing those that show nothing of the image.
+    panel; `missing` the (row, column) of the others; `traced` how many virtual points were traced.
     """
 
     edges_x: Array
@@ -79,12 +73,9 @@ class ZonePlan:
     reference_turns: Series
     window: PupilWindow
     traced: int
-    warped: bool = False
 
     def left_out(self) -> list[str]:
-        """Return a sentence for each zone or patch that no image can need."""
-        if self.warped:
-            return [f"patch row {r + 1}, column {c + 1}: shows nothing of the field" for r, c in self.missing]
+        """Return a sentence for each zone that no scene can need."""
         return [f"zone row {r + 1}, column {c + 1}: its footprint misses the panel" for r, c in self.missing]
 
 
@@ -110,10 +101,15 @@ def _field_basis(field_tan: Array, half_tan: tuple[float, float], degree: int) -
     return np.stack([x[:, i] * y[:, j] for i in range(degree + 1) for j in range(degree + 1 - i)], axis=-1)
 
 
+def zone_count(settings: HologramSettings) -> int:
+    """Return how many zones lie along each side of the field."""
+    return settings.method.count if isinstance(settings.method, Zones) else Zones().count
+
+
 def zone_borders(settings: HologramSettings) -> tuple[Array, Array]:
     """Return the zones' borders in x and y, (zones + 1,) ascending tangents, evenly spaced like the image's pixels."""
     half = np.tan(np.asarray(settings.fov_rad) / 2)
-    line = np.linspace(-1.0, 1.0, settings.zones + 1)
+    line = np.linspace(-1.0, 1.0, zone_count(settings) + 1)
     return line * half[0], line * half[1]
 
 
@@ -125,12 +121,12 @@ def table_points(settings: HologramSettings) -> Array:
     """
     x, y = zone_borders(settings)
     centres = np.stack(np.meshgrid((x[1:] + x[:-1]) / 2, (y[1:] + y[:-1])[::-1] / 2), axis=-1).reshape(-1, 2)
-    if settings.zones >= 5:
+    if zone_count(settings) >= 5:
         inner = np.stack(np.meshgrid(x[1:-1], y[1:-1]), axis=-1).reshape(-1, 2)
         outer = np.stack(np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0]), axis=-1).reshape(-1, 2)
         outer = outer[np.any(outer != 0, axis=-1)] * (x[-1], y[-1])
         return np.concatenate([centres, inner, outer])
-    lines = np.linspace(-1.0, 1.0, _CORNERS if settings.zones < 4 else _CORNERS - 1)
+    lines = np.linspace(-1.0, 1.0, _CORNERS if zone_count(settings) < 4 else _CORNERS - 1)
     corners = np.stack(np.meshgrid(lines * x[-1], lines * y[-1]), axis=-1).reshape(-1, 2)
     return np.concatenate([centres, corners])
 
@@ -153,16 +149,14 @@ def point_table(settings: HologramSettings) -> PointTable:
 
 @lru_cache(maxsize=8)
 def zone_plan(settings: HologramSettings) -> ZonePlan:
-    """Return the zones of a setting, or its warped patches: traced once, kept for the next image."""
+    """Return the zones of a setting: traced once, kept for the next scene."""
     reference = reference_turns(settings)
-    if settings.warped:
-        return warped_plan(settings, reference)
     table = point_table(settings)
     x, y = zone_borders(settings)
     zones, missing = [], []
-    for row in range(settings.zones):
-        for column in range(settings.zones):
-            low, high = settings.zones - 1 - row, settings.zones - row
+    for row in range(zone_count(settings)):
+        for column in range(zone_count(settings)):
+            low, high = zone_count(settings) - 1 - row, zone_count(settings) - row
             bounds = ((float(x[column]), float(x[column + 1])), (float(y[low]), float(y[high])))
             zone = _zone(settings, table, reference, row, column, bounds)
             if zone is None:
@@ -170,37 +164,6 @@ def zone_plan(settings: HologramSettings) -> ZonePlan:
             else:
                 zones.append(zone)
     return ZonePlan(x, y, tuple(zones), tuple(missing), reference, pupil_window(settings), len(table.traced.radius_m))
-
-
-def warped_plan(settings: HologramSettings, reference: Series) -> ZonePlan:
-    """Return the panel in patches, each with the points that it can show to the pupil, in warped coordinates.
-
-    Every pixel is computed once, there are no borders in the image, and no light is spent where it would alias into the
-    pupil: a patch shows only the points whose footprints touch it.
-    """
-    half = settings.panel.half_size_m
-    across, down = (int(np.ceil(2 * h / widest - 1e-6)) for h, widest in zip(half, PATCH_M, strict=True))
-    lines_x, lines_y = np.linspace(-half[0], half[0], across + 1), np.linspace(-half[1], half[1], down + 1)
-    limit = np.tan(np.asarray(settings.fov_rad) / 2)
-    patches, missing = [], []
-    for row in range(down):
-        for column in range(across):
-            left, right = lines_x[column], lines_x[column + 1]
-            low, high = lines_y[down - 1 - row], lines_y[down - row]
-            outline = np.array([[left, low], [right, low], [right, high], [left, high]])
-            seen = visible_field(settings, outline)
-            bounds = tuple((max(float(a), -lim), min(float(b), lim)) for (a, b), lim in zip(seen, limit, strict=True))
-            if any(b <= a for a, b in bounds):
-                missing.append((row, column))
-                continue
-            pivot = outline.mean(axis=0)
-            form = fit_warp(settings, bounds, outline, pivot)  # type: ignore[arg-type]
-            factor = form.phase_rad.times(1 / (2 * np.pi)) + (-reference)
-            shift = form.field.times(1 / (2 * np.pi))
-            band = _warped_band(factor, form.coordinate_m, shift, bounds, outline)  # type: ignore[arg-type]
-            patches.append(Zone(row, column, factor, shift, pivot, outline, band, bounds, form.coordinate_m))  # type: ignore[arg-type]
-    borders = zone_borders(settings)
-    return ZonePlan(*borders, tuple(patches), tuple(missing), reference, pupil_window(settings), 0, warped=True)
 
 
 def _zone(
@@ -219,7 +182,7 @@ def _zone(
     if not len(samples):
         return None
     pivot = area @ samples
-    own = table.traced[row * settings.zones + column]
+    own = table.traced[row * zone_count(settings) + column]
     factor = fit_series(
         lambda slm_m: own.phase(slm_m) / (2 * np.pi), degree=3, centre=(0.0, 0.0), half=settings.panel.half_size_m
     ) + (-reference)
@@ -283,23 +246,3 @@ def _at(series: Series, points: Array) -> Array:
     """Return a series at scattered points (n, 2)."""
     in_y, in_x = series.bases(points[:, 0], points[:, 1])
     return np.asarray(np.einsum("ni,ij...,nj->n...", in_y, series.coefficients, in_x))
-
-
-def _warped_band(
-    factor: Series,
-    warp: Series,
-    shift: Series,
-    bounds: tuple[tuple[float, float], tuple[float, float]],
-    outline: Array,
-) -> tuple[float, float]:
-    """Return the largest |frequency| along x and y of a patch's light at its corners, cycles per metre."""
-    step, found = 1e-6, []
-    tilt = shift.on_grid(np.array(bounds[0]), np.array(bounds[1]))[..., :2].reshape(-1, 2)
-    for axis in (0, 1):
-        ahead, behind = outline.copy(), outline.copy()
-        ahead[:, axis] += step
-        behind[:, axis] -= step
-        own = (_at(factor, ahead) - _at(factor, behind)) / (2 * step)
-        stretch = (_at(warp, ahead) - _at(warp, behind)) / (2 * step)
-        found.append(float(np.max(np.abs(own[:, None] + stretch @ tilt.T))))
-    return found[0], found[1]

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 from holocal.hologram.pipeline import HologramSettings, render_image
+from holocal.hologram.settings import Zones
 from holocal.optics.bench import Bench, Panel, field_directions
 from holocal.optics.phase_function import VirtualPoints, exact_phase
 from holocal.optics.raytrace import connect, trace_to_pupil, trace_to_slm
 
 DEG = np.pi / 180
 PANEL = Panel(72, 60, 6e-6)
-SETTINGS = HologramSettings(PANEL, Bench(), 515e-9, (8 * DEG, 8 * DEG), zones=3)
+SETTINGS = HologramSettings(PANEL, Bench(), 515e-9, (8 * DEG, 8 * DEG), method=Zones(3))
 SLM = np.stack(np.meshgrid(PANEL.x_m, PANEL.y_m), axis=-1)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from holocal.errors import InputError
+from holocal.hologram.scenes.points import PointCloud
 from holocal.optics.bench import Array, image_tangents
 
 _MOST_POINTS = 64_000_000  # an 8000 x 8000 image; more than the panel could ever resolve
@@ -42,19 +43,6 @@ class ZeroPhase:
         return np.zeros((len(y_tan), len(x_tan)))
 
 
-@dataclass(frozen=True)
-class PointGrid:
-    """Luminous points on a rectilinear grid of tangents.
-
-    `x_tan` (w,) ascending, `y_tan` (h,) descending; `amplitude` and `phase_rad` (h, w).
-    """
-
-    x_tan: Array
-    y_tan: Array
-    amplitude: Array
-    phase_rad: Array
-
-
 def checked_intensity(intensity: ArrayLike) -> NDArray[np.float64]:
     """Return the image as float64 (rows, columns), or raise InputError naming what is wrong with it."""
     image = np.asarray(intensity)
@@ -77,11 +65,19 @@ def checked_intensity(intensity: ArrayLike) -> NDArray[np.float64]:
     return image
 
 
-def image_points(intensity: ArrayLike, *, fov_rad: tuple[float, float], initial_phase: InitialPhase) -> PointGrid:
+def image_cloud(
+    intensity: ArrayLike, *, fov_rad: tuple[float, float], depth_m: float = np.inf, initial_phase: InitialPhase
+) -> PointCloud:
     """Return the points of an image (rows, columns) of intensities that covers `fov_rad`, centred on the gaze.
 
-    The amplitude is sqrt(intensity), whatever the scale; the phase is `initial_phase` of the grid.
+    One point per pixel, row by row from the top, at `depth_m` from the pupil's centre. The amplitude is
+    sqrt(intensity), whatever the scale; the phase is `initial_phase` of the grid.
     """
     image = checked_intensity(intensity)
     x, y = image_tangents(image.shape[1], image.shape[0], fov_rad)
-    return PointGrid(x, y, np.sqrt(image), initial_phase(x, y))
+    return PointCloud(
+        np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2),
+        np.full(image.size, depth_m),
+        np.sqrt(image).ravel(),
+        initial_phase(x, y).ravel(),
+    )
