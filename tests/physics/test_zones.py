@@ -14,7 +14,7 @@ from holocal.hologram.grid import Grid, panel_grid, resample_compact, synthesis_
 from holocal.hologram.reference import pupil_window, reference_turns
 from holocal.hologram.series import fit_series
 from holocal.hologram.settings import HologramSettings, Zones
-from holocal.hologram.zone_error import zone_wavefront_errors
+from holocal.hologram.wavefront_error import zone_wavefront_errors
 from holocal.hologram.zone_sum import zone_sum
 from holocal.hologram.zones import point_table, table_points, zone_plan
 from holocal.optics.bench import Bench, Panel, Pose
