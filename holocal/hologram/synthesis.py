@@ -10,7 +10,6 @@ import hashlib
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 
 import numpy as np
 import torch
@@ -28,6 +27,7 @@ from holocal.hologram.zone_sum import zones_on_panel
 from holocal.hologram.zones import zone_plan
 from holocal.optics.bench import Array
 
+_ENGINES_KEPT = 2  # 0.25 GB each on the 4K panel
 _KEPT = 2  # sets of points whose transforms are kept: 0.25 GB each for 750 x 750 points on the 4K panel
 _DENSE = 0.5  # share of lit points from which a scene's dark points are summed too: the transforms stay those of before
 
@@ -184,11 +184,38 @@ def _digest(values: NDArray[np.float64]) -> bytes:
 
 def _engine(settings: HologramSettings, store: Store | None) -> WarpedEngine:
     """Return the engine of a setting, whatever its depth and number of iterations."""
-    return _made(replace(settings, depth_m=np.inf, iterations=0, device="cpu"), store)
+    return _ENGINES.of(replace(settings, depth_m=np.inf, iterations=0, device="cpu"), store)
 
 
-@lru_cache(maxsize=2)
-def _made(settings: HologramSettings, store: Store | None) -> WarpedEngine:
-    made = stored_plan(settings, Depth(0.0), None, store).layout
-    panel = to_panel(made, settings.panel, tolerance=tolerance_of(settings))
-    return WarpedEngine(settings, made.cut, panel, store)
+@dataclass
+class Engines:
+    """The engines of the last settings; a second one for a program that goes to and fro between two colours."""
+
+    kept: OrderedDict[tuple[HologramSettings, Store | None], WarpedEngine] = field(default_factory=OrderedDict)
+
+    def of(self, settings: HologramSettings, store: Store | None) -> WarpedEngine:
+        """Return the engine of a setting, made if it is not kept."""
+        key = (settings, store)
+        found = self.kept.pop(key, None)
+        if found is None:
+            while len(self.kept) >= _ENGINES_KEPT:  # first, so that three are never there at once
+                self.kept.popitem(last=False)
+            made = stored_plan(settings, Depth(0.0), None, store).layout
+            panel = to_panel(made, settings.panel, tolerance=tolerance_of(settings))
+            found = WarpedEngine(settings, made.cut, panel, store)
+        self.kept[key] = found
+        return found
+
+
+_ENGINES = Engines()
+
+
+def forget_engines() -> None:
+    """Throw away what settings share: the next hologram is made from nothing, but for plans that `warped` keeps."""
+    _ENGINES.kept.clear()
+
+
+def forget_points() -> None:
+    """Throw away the transforms of points seen before; what belongs to the panel stays."""
+    for engine in _ENGINES.kept.values():
+        engine.kept.clear()

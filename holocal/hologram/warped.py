@@ -291,3 +291,9 @@ def pupil_mask(made: Layout, diameter_m: float, aperture: Aperture | None = None
         turn = 0.5 * (c[0, 0] * s_x**2 + c[1, 1] * y**2 + 2 * c[0, 1] * s_x * y)
         spread[row] *= np.exp(-1j * turn).astype(np.complex64)
     return np.asarray(scipy.fft.fft2(spread, workers=2, overwrite_x=True), np.complex64)
+
+
+def forget_plans() -> None:
+    """Throw away all plans: the next is traced from nothing."""
+    for kept in (accurate_plan, warped_plan, layout, _sight):
+        kept.cache_clear()

@@ -13,8 +13,10 @@ from dataclasses import dataclass, field
 import finufft
 import numpy as np
 import scipy.fft
+import torch
 from numpy.typing import NDArray
 
+from holocal.hologram.encode.blocks import in_blocks
 from holocal.hologram.scenes.points import Aperture
 from holocal.hologram.settings import HologramSettings
 from holocal.hologram.warped import Layout, Patch, PatchForm, WarpedPlan, accuracy_of, inside_outline, pupil_mask
@@ -26,14 +28,14 @@ _BLOCK = 128  # rows at a time: float64 work that stays in the cache
 
 
 def tolerance_of(settings: HologramSettings) -> float:
-    """Return the relative accuracy of the transforms: their errors are a twentieth of the one asked for."""
-    return float(np.clip(accuracy_of(settings) / 25, 1e-5, 5e-3))
+    """Return the relative accuracy of the transforms: asked for a tenth, they are twice as good as that."""
+    return float(np.clip(accuracy_of(settings) / 10, 1e-5, 1e-2))
 
 
-def _options() -> dict[str, float]:
+def _options(threads: int) -> dict[str, float]:
     # Fine grids 1.25 times oversampled are 3 times faster than 2 times. Points and samples come in rows, near enough
     # to sorted: sorting them costs more memory than it saves time.
-    return {"upsampfac": 1.25, "spread_sort": 0}
+    return {"upsampfac": 1.25, "spread_sort": 0, "nthreads": threads}
 
 
 @dataclass
@@ -69,8 +71,9 @@ class PatchSums:
         """Return the hologram divided by the reference on the sight grid, for the points' complex amplitudes (n,)."""
         grid = self.plan.layout.grid
         total = np.zeros((grid.rows, grid.columns), np.complex64)
-        for one in self.sums:
-            one.write_to(total, strengths)
+        # A patch per thread, from gathering its points to its last product: a quarter faster than two threads in each
+        # transform, which work one after the other in all that is not the transform.
+        in_blocks(lambda part: [one.write_to(total, strengths) for one in self.sums[part]], len(self.sums), 1)
         return total
 
 
@@ -93,7 +96,7 @@ def _patch_sum(
     sources = tuple(np.ascontiguousarray(ub[:, axis], np.float32) for axis in (0, 1))
     coordinate = warp.coordinate.on_grid(s_x, s_y).astype(np.float32)
     targets = tuple(np.ascontiguousarray(coordinate[..., axis]).ravel() for axis in (0, 1))
-    plan = finufft.Plan(3, 2, 1, tolerance, 1, dtype="complex64", **_options())
+    plan = finufft.Plan(3, 2, 1, tolerance, 1, dtype="complex64", **_options(1))
     plan.setpts(*sources, None, *targets)
     factor = phasor(warp.phase_rad.on_grid(s_x, s_y))
     buffer = np.empty(len(targets[0]), np.complex64)
@@ -161,7 +164,9 @@ def to_panel(layout: Layout, panel: Panel, *, tolerance: float) -> ToPanel:
         for part, turns in zip(place[:, top : top + _BLOCK], (down, across), strict=True):
             part[:] = (turns - np.round(turns)) * (2 * np.pi)
     targets = (place[0].ravel(), place[1].ravel())
-    plan = finufft.Plan(2, (len(rows), len(columns)), 1, tolerance, 1, dtype="complex64", **_options())
+    plan = finufft.Plan(
+        2, (len(rows), len(columns)), 1, tolerance, 1, dtype="complex64", **_options(torch.get_num_threads())
+    )
     plan.setpts(*targets)
     return ToPanel(layout, panel, plan, targets, rows, columns)
 

@@ -81,6 +81,7 @@ def zones_on_panel(
     """Return `zone_sum` on the panel's own pixels, of the frequencies up to `reach` (rows, columns) only."""
     panel, grid = settings.panel, synthesis_grid(plan, settings.panel)
     found, dark = zone_sum(plan, grid, field_tan, strengths, device=settings.device)
+    reach = tuple(min(r, (n - 1) // 2) for r, n in zip(reach, (grid.rows, grid.columns), strict=True))  # type: ignore[assignment]
     coarse = WindowedTransform(grid.rows, grid.columns, *reach, settings.device)
     fine = WindowedTransform(panel.height, panel.width, *reach, settings.device)
     compact = resample_compact(coarse.forward(found), reach, grid, panel_grid(panel))
