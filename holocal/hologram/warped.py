@@ -287,9 +287,11 @@ def pupil_mask(made: Layout, diameter_m: float, aperture: Aperture | None = None
     )
     c = made.curvature
     spread = scipy.fft.ifft2(wanted, workers=2, overwrite_x=True)
-    for row, y in enumerate(s_y):
-        turn = 0.5 * (c[0, 0] * s_x**2 + c[1, 1] * y**2 + 2 * c[0, 1] * s_x * y)
-        spread[row] *= np.exp(-1j * turn).astype(np.complex64)
+    spread *= np.exp(-0.5j * c[0, 0] * s_x**2).astype(np.complex64)
+    spread *= np.exp(-0.5j * c[1, 1] * s_y**2).astype(np.complex64)[:, None]
+    if abs(c[0, 1]) * np.abs(s_x).max() * np.abs(s_y).max() > 1e-3:
+        for row, y in enumerate(s_y):
+            spread[row] *= np.exp(-1j * c[0, 1] * y * s_x).astype(np.complex64)
     return np.asarray(scipy.fft.fft2(spread, workers=2, overwrite_x=True), np.complex64)
 
 

@@ -8,6 +8,7 @@ Sorting points and samples takes as long as summing them: what depends only on w
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass, field
 
 import finufft
@@ -24,6 +25,7 @@ from holocal.optics.bench import Array, Panel
 
 Complex = NDArray[np.complex64]
 Floats = NDArray[np.float32]
+_PLANNING = threading.Lock()  # FFTs may be planned by one thread at a time only
 _BLOCK = 128  # rows at a time: float64 work that stays in the cache
 
 
@@ -71,19 +73,29 @@ class PatchSums:
         """Return the hologram divided by the reference on the sight grid, for the points' complex amplitudes (n,)."""
         grid = self.plan.layout.grid
         total = np.zeros((grid.rows, grid.columns), np.complex64)
+
         # A patch per thread, from gathering its points to its last product: a quarter faster than two threads in each
         # transform, which work one after the other in all that is not the transform.
-        in_blocks(lambda part: [one.write_to(total, strengths) for one in self.sums[part]], len(self.sums), 1)
+        def write(part: slice) -> None:
+            for one in self.sums[part]:
+                one.write_to(total, strengths)
+
+        in_blocks(write, len(self.sums), 1)
         return total
 
 
 def patch_sums(plan: WarpedPlan, field_tan: Array, *, tolerance: float) -> PatchSums:
     """Return the transforms of a plan for points at tangents (n, 2); `tolerance` is their relative accuracy."""
-    sums = []
-    for form in plan.forms:
-        index = np.flatnonzero(inside_outline(field_tan, form.seen))
-        if index.size:
-            sums.append(_patch_sum(plan.layout, form, index, field_tan[index], tolerance))
+    found: list[PatchSum | None] = [None] * len(plan.forms)
+
+    def make(part: slice) -> None:
+        for i in range(part.start, part.stop):
+            index = np.flatnonzero(inside_outline(field_tan, plan.forms[i].seen))
+            if index.size:
+                found[i] = _patch_sum(plan.layout, plan.forms[i], index, field_tan[index], tolerance)
+
+    in_blocks(make, len(found), 1)
+    sums = [one for one in found if one is not None]
     return PatchSums(plan, sums, len(plan.layout.patches) - len(sums))
 
 
@@ -96,9 +108,10 @@ def _patch_sum(
     sources = tuple(np.ascontiguousarray(ub[:, axis], np.float32) for axis in (0, 1))
     coordinate = warp.coordinate.on_grid(s_x, s_y).astype(np.float32)
     targets = tuple(np.ascontiguousarray(coordinate[..., axis]).ravel() for axis in (0, 1))
-    plan = finufft.Plan(3, 2, 1, tolerance, 1, dtype="complex64", **_options(1))
-    plan.setpts(*sources, None, *targets)
     factor = phasor(warp.phase_rad.on_grid(s_x, s_y))
+    with _PLANNING:
+        plan = finufft.Plan(3, 2, 1, tolerance, 1, dtype="complex64", **_options(1))
+        plan.setpts(*sources, None, *targets)
     buffer = np.empty(len(targets[0]), np.complex64)
     return PatchSum(patch, index, phasor(ub[:, 2]), factor, plan, (*sources, *targets), buffer)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -53,7 +54,7 @@ def methods(width: int, height: int, *, runs: int) -> Iterator[Row]:
         began = time.perf_counter()
         synthesise(scene, settings)
         cold = time.perf_counter() - began
-        timing = unit.ratio(lambda scene=scene, settings=settings: synthesise(scene, settings), runs=runs)
+        timing = unit.ratio(partial(synthesise, scene, settings), runs=runs)
         yield name | timing.row() | {"cold_seconds": cold} | _errors(settings)
 
 
@@ -78,7 +79,7 @@ def densities(width: int, height: int, *, runs: int) -> Iterator[Row]:
         engine.forget_points()
         engine.synthesise([part], settings, reach=_WHOLE, clock=clock)
         first = sum(clock.seconds.values())
-        timing = unit.ratio(lambda part=part: synthesise(part, settings), runs=runs)
+        timing = unit.ratio(partial(synthesise, part, settings), runs=runs)
         yield (
             {"table": "density", "size": f"{width}x{height}", "scene": name}
             | timing.row()
