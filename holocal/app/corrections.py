@@ -1,68 +1,163 @@
-"""Accepted maps applied to a scene: brightness is divided out of the image's intensity."""
+"""Accepted corrections, each where it belongs: points, wavefront, levels.
+
+| procedure | channels of its maps | acts on |
+|---|---|---|
+| uniformity | ``correction.intensity_weight`` | a point's intensity |
+| distortion | ``correction.shift_tan_x``, ``correction.shift_tan_y`` | a point's direction, added to its tangents |
+| aberration | ``correction.noll_<j>_rad`` at ``wavelength_nm`` | the points' phase functions |
+| response | ``correction.phase_rad``, 256 columns | the levels |
+
+Maps are rectilinear over their ``extent_deg``, row 0 on top, of directions seen from the eye, not from the gaze.
+"""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from holocal.errors import InputError
+from holocal.hologram.scenes.points import PointCloud
+from holocal.hologram.wavefront import Wavefront, field_basis
+from holocal.optics.bench import Array, Bench
 from holocal.records.calibration import Accepted
-from holocal.units import DEGREE
+from holocal.units import DEGREE, NM
 
-UNIFORMITY = "uniformity"
+UNIFORMITY, DISTORTION, ABERRATION, RESPONSE = "uniformity", "distortion", "aberration", "response"
 WEIGHT = "correction.intensity_weight"
+SHIFTS = ("correction.shift_tan_x", "correction.shift_tan_y")
+NOLL = re.compile(r"correction\.noll_(\d+)_rad")
+PHASE = "correction.phase_rad"
+_FIELD_DEGREE = 5  # of a Zernike coefficient over the field; the residual of the fit is its own check
+_LEVELS = 256
 
 
-def corrected(
-    intensity: NDArray[np.float32],
-    accepted: Mapping[str, Accepted],
-    *,
-    fov_rad: tuple[float, float],
-    gaze_rad: tuple[float, float],
-) -> NDArray[np.float32]:
-    """Return a scene's intensity, (height, width), times the accepted brightness weight at each pixel's direction.
+@dataclass(frozen=True)
+class Corrections:
+    """What the accepted calibration does to a scene.
 
-    The scene covers `fov_rad` about `gaze_rad` and the map its own ``extent_deg``; both are rectilinear (pixels are
-    evenly spaced in the tangent of the angle), row 0 on top. Beyond the map its edge value holds. A weight is in
-    (0, 1]; without an accepted uniformity the scene comes back as it is.
+    `weight` and `shift` map directions; `wavefront` and `response_rad` (256,) are for the engine; `identities` names
+    the corrections in force that change nothing and are left out.
     """
-    found = accepted.get(UNIFORMITY)
-    if found is None:
-        return intensity
-    weight, extent = found.maps.channels.get(WEIGHT), found.maps.extent_deg
-    if weight is None or extent is None:
-        raise InputError(
-            f"the uniformity calibration {found.entry} has no channel {WEIGHT} with an extent.",
-            fix="Measure it again, or use `--corrections none`.",
+
+    weight: FieldMap | None = None
+    shift: tuple[FieldMap, FieldMap] | None = None
+    wavefront: Wavefront | None = None
+    response_rad: Array | None = None
+    identities: tuple[str, ...] = ()
+
+    def apply(self, cloud: PointCloud, gaze_rad: tuple[float, float]) -> PointCloud:
+        """Return a cloud with corrected directions and brightness; the tangents of a cloud are relative to the gaze."""
+        if self.shift is None and self.weight is None:
+            return cloud
+        axes = Bench.nominal().pupil_axes(gaze_rad)
+        seen = _turned(cloud.field_tan, axes)
+        if self.shift is not None:
+            seen = seen + np.stack([one.at(seen) for one in self.shift], axis=-1)
+            cloud = replace(cloud, field_tan=_turned(seen, axes.T))
+        if self.weight is not None:
+            cloud = replace(cloud, amplitude=cloud.amplitude * np.sqrt(np.maximum(self.weight.at(seen), 0.0)))
+        return cloud
+
+
+def _turned(field_tan: Array, axes: Array) -> Array:
+    """Return the tangents (n, 2) in E of directions with tangents in a frame of these axes (3, 3)."""
+    turned = np.concatenate([field_tan, np.ones((len(field_tan), 1))], axis=1) @ axes.T
+    return np.asarray(turned[:, :2] / turned[:, 2:])
+
+
+@dataclass(frozen=True)
+class FieldMap:
+    """Values (h, w) over a rectangle of tangents (left, right, bottom, top), pixel centres half a pixel inside."""
+
+    values: Array
+    extent_tan: tuple[float, float, float, float]
+
+    def at(self, field_tan: Array) -> Array:
+        """Return the values (n,) at tangents (n, 2), bilinear; beyond the map its edge holds."""
+        left, right, bottom, top = self.extent_tan
+        height, width = self.values.shape
+        column = np.clip((field_tan[:, 0] - left) / (right - left) * width - 0.5, 0, width - 1)
+        row = np.clip((top - field_tan[:, 1]) / (top - bottom) * height - 0.5, 0, height - 1)
+        x, y = (
+            np.minimum(np.floor(place).astype(int), max(size - 2, 0))
+            for place, size in ((column, width), (row, height))
         )
-    rows, columns = intensity.shape
-    x = _tangents(columns, fov_rad[0], gaze_rad[0])
-    y = _tangents(rows, fov_rad[1], gaze_rad[1])[::-1]  # row 0 is the top
-    left, right, bottom, top = (np.tan(angle * DEGREE) for angle in extent)
-    height, width = weight.shape
-    column = (x - left) / (right - left) * width - 0.5
-    row = (top - y) / (top - bottom) * height - 0.5
-    weighted: NDArray[np.float32] = np.asarray(intensity * _bilinear(weight, row, column), np.float32)
-    return weighted
+        right_of, below = np.minimum(x + 1, width - 1), np.minimum(y + 1, height - 1)
+        u, v = column - x, row - y
+        upper = self.values[y, x] * (1 - u) + self.values[y, right_of] * u
+        lower = self.values[below, x] * (1 - u) + self.values[below, right_of] * u
+        return np.asarray(upper * (1 - v) + lower * v)
 
 
-def _tangents(count: int, full_rad: float, centre_rad: float) -> NDArray[np.float64]:
-    half = np.tan(full_rad / 2)
-    return np.asarray(np.tan(centre_rad) + half * (2 * np.arange(count) + 1 - count) / count)
+def corrections_of(accepted: Mapping[str, Accepted], *, fov_rad: tuple[float, float]) -> Corrections:
+    """Return the corrections of accepted runs; those that change nothing are named and left out.
+
+    Raises
+    ------
+    InputError
+        An accepted run has not the channels that its procedure promises.
+    """
+    found, identities = Corrections(), []
+    if one := accepted.get(UNIFORMITY):
+        weight = _map(one, WEIGHT)
+        identities += _kept_out(UNIFORMITY, bool(np.all(weight.values == 1)))
+        found = replace(found, weight=None if UNIFORMITY in identities else weight)
+    if one := accepted.get(DISTORTION):
+        shift = (_map(one, SHIFTS[0]), _map(one, SHIFTS[1]))
+        identities += _kept_out(DISTORTION, not (shift[0].values.any() or shift[1].values.any()))
+        found = replace(found, shift=None if DISTORTION in identities else shift)
+    if one := accepted.get(ABERRATION):
+        wavefront = _wavefront(one, fov_rad)
+        identities += _kept_out(ABERRATION, wavefront.is_identity())
+        found = replace(found, wavefront=None if ABERRATION in identities else wavefront)
+    if one := accepted.get(RESPONSE):
+        phase = _response(one)
+        linear = np.arange(_LEVELS) * (2 * np.pi / _LEVELS)
+        identities += _kept_out(RESPONSE, bool(np.allclose(phase, linear, atol=1e-6)))
+        found = replace(found, response_rad=None if RESPONSE in identities else phase)
+    return replace(found, identities=tuple(identities))
 
 
-def _bilinear(
-    values: NDArray[np.float32], row: NDArray[np.float64], column: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return `values` on the grid of (row, column), separably, edges held."""
-    return np.asarray(_along(_along(values.astype(np.float64), row).T, column).T)
+def _kept_out(name: str, identity: bool) -> list[str]:
+    return [name] if identity else []
 
 
-def _along(values: NDArray[np.float64], at: NDArray[np.float64]) -> NDArray[np.float64]:
-    last = values.shape[0] - 1
-    clipped = np.clip(at, 0, last)
-    low = np.minimum(np.floor(clipped).astype(int), max(last - 1, 0))
-    part = (clipped - low)[:, None]
-    return np.asarray((1 - part) * values[low] + part * values[np.minimum(low + 1, last)])
+def _map(accepted: Accepted, channel: str) -> FieldMap:
+    values, extent = accepted.maps.channels.get(channel), accepted.maps.extent_deg
+    if values is None or extent is None:
+        raise _missing(accepted, f"channel {channel} with an extent")
+    left, right, bottom, top = (float(np.tan(angle * DEGREE)) for angle in extent)
+    return FieldMap(np.asarray(values, np.float64), (left, right, bottom, top))
+
+
+def _wavefront(accepted: Accepted, fov_rad: tuple[float, float]) -> Wavefront:
+    """Return the accepted Zernike maps as polynomials over the field, fitted to their pixels inside it."""
+    names = {int(match[1]): name for name in accepted.maps.channels if (match := NOLL.fullmatch(name))}
+    wavelength = accepted.maps.metadata.get("wavelength_nm")
+    if not names or not isinstance(wavelength, (int, float)):
+        raise _missing(accepted, "channels correction.noll_<j>_rad and a wavelength_nm")
+    maps = {j: _map(accepted, names[j]) for j in sorted(names)}
+    half = (float(np.tan(fov_rad[0] / 2)), float(np.tan(fov_rad[1] / 2)))
+    line = np.linspace(-1, 1, 4 * _FIELD_DEGREE + 1)
+    nodes = np.stack(np.meshgrid(line * half[0], line * half[1]), axis=-1).reshape(-1, 2)
+    inverse = np.linalg.pinv(field_basis(nodes, half, _FIELD_DEGREE))
+    rows = tuple(tuple(float(c) for c in inverse @ one.at(nodes)) for one in maps.values())
+    return Wavefront(tuple(maps), rows, half, _FIELD_DEGREE, float(wavelength) * NM)
+
+
+def _response(accepted: Accepted) -> Array:
+    values: NDArray[np.float32] | None = accepted.maps.channels.get(PHASE)
+    if values is None or values.size != _LEVELS:
+        raise _missing(accepted, f"channel {PHASE} with {_LEVELS} values")
+    return np.asarray(values, np.float64).ravel()
+
+
+def _missing(accepted: Accepted, what: str) -> InputError:
+    return InputError(
+        f"the {accepted.procedure} calibration {accepted.entry} has no {what}.",
+        fix="Measure it again, or use `--corrections none`.",
+    )

@@ -6,7 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
-from holocal.app.corrections import WEIGHT, corrected
+from holocal.app.corrections import PHASE, SHIFTS, WEIGHT, corrections_of
+from holocal.errors import InputError
+from holocal.hologram.scenes.points import PointCloud
+from holocal.optics.bench import Bench
+from holocal.optics.zernike import zernike
 from holocal.records.calibration import Accepted
 from holocal.records.frames import write_frame
 from holocal.records.maps import Maps, read_maps
@@ -51,25 +55,90 @@ def test_a_frame_of_another_panel_is_refused(holocal, workplace):
     assert answer.json["error"]["measured"] == [31, 24]
 
 
-def accepted(weight: np.ndarray, extent: tuple[float, float, float, float]) -> dict[str, Accepted]:
-    maps = Maps({WEIGHT: weight.astype(np.float32)}, {"extent_deg": extent})
-    return {"uniformity": Accepted("uniformity", "run", "", {}, maps)}
+def accepted(procedure: str, channels: dict[str, np.ndarray], **metadata: object) -> dict[str, Accepted]:
+    maps = Maps({name: values.astype(np.float32) for name, values in channels.items()}, metadata)
+    return {procedure: Accepted(procedure, "run", "", {}, maps)}
 
 
-def test_a_weight_that_is_linear_in_the_tangent_is_applied_at_each_pixels_direction():
-    # An oracle in closed form: bilinear interpolation is exact on a function that is linear in both tangents.
+EXTENT = (-12.5, 12.5, -12.5, 12.5)
+FOV = (25 * DEGREE, 25 * DEGREE)
+
+
+def linear_map(start: float, x: float, y: float) -> np.ndarray:
+    """Return a map over EXTENT that is linear in both tangents; bilinear interpolation is exact on it."""
     half = np.tan(12.5 * DEGREE)
-    x = half * (2 * np.arange(50) + 1 - 50) / 50
-    y = half * (2 * np.arange(40) + 1 - 40)[::-1] / 40
-    weight = 0.6 + 0.8 * x[None, :] - 0.5 * y[:, None]
-    scene = np.random.default_rng(1).uniform(0.2, 1.0, (31, 23)).astype(np.float32)
-    fov = (10 * DEGREE, 14 * DEGREE)
-    found = corrected(scene, accepted(weight, (-12.5, 12.5, -12.5, 12.5)), fov_rad=fov, gaze_rad=(0.0, 0.0))
-    tx = np.tan(fov[0] / 2) * (2 * np.arange(23) + 1 - 23) / 23
-    ty = np.tan(fov[1] / 2) * (2 * np.arange(31) + 1 - 31)[::-1] / 31
-    np.testing.assert_allclose(found, scene * (0.6 + 0.8 * tx[None, :] - 0.5 * ty[:, None]), rtol=1e-5)
+    across = half * (2 * np.arange(50) + 1 - 50) / 50
+    down = half * (2 * np.arange(40) + 1 - 40)[::-1] / 40
+    return start + x * across[None, :] + y * down[:, None]
 
 
-def test_without_an_accepted_uniformity_the_scene_is_unchanged():
-    scene = np.ones((4, 5), np.float32)
-    assert corrected(scene, {}, fov_rad=(0.1, 0.1), gaze_rad=(0.0, 0.0)) is scene
+def points(gaze: tuple[float, float] = (0.0, 0.0)) -> tuple[PointCloud, np.ndarray]:
+    """Return points inside EXTENT, and their tangents as the eye sees them, gaze or not."""
+    rng = np.random.default_rng(1)
+    tangents = rng.uniform(-0.15, 0.15, (80, 2))
+    directions = np.concatenate([tangents, np.ones((80, 1))], axis=1) @ Bench().pupil_axes(gaze)  # into the gaze's frame
+    cloud = PointCloud(directions[:, :2] / directions[:, 2:], np.full(80, np.inf), rng.uniform(0.2, 1, 80), np.zeros(80))
+    return cloud, tangents
+
+
+@pytest.mark.parametrize("gaze", [(0.0, 0.0), (0.06, -0.04)])
+def test_a_weight_that_is_linear_in_the_tangent_is_applied_at_each_points_direction(gaze):
+    found = corrections_of(
+        accepted("uniformity", {WEIGHT: linear_map(0.6, 0.8, -0.5)}, extent_deg=EXTENT), fov_rad=FOV
+    )
+    cloud, tangents = points(gaze)
+    wanted = cloud.amplitude**2 * (0.6 + 0.8 * tangents[:, 0] - 0.5 * tangents[:, 1])
+    np.testing.assert_allclose(found.apply(cloud, gaze).amplitude ** 2, wanted, rtol=1e-5)
+
+
+def test_a_distortion_moves_points_and_the_brightness_is_that_of_where_they_are_shown():
+    shift = {SHIFTS[0]: linear_map(0.002, 0.1, 0.0), SHIFTS[1]: linear_map(-0.001, 0.0, 0.2)}
+    weight = {WEIGHT: linear_map(0.6, 0.8, -0.5)}
+    both = accepted("distortion", shift, extent_deg=EXTENT) | accepted("uniformity", weight, extent_deg=EXTENT)
+    cloud, tangents = points()
+    found = corrections_of(both, fov_rad=FOV).apply(cloud, (0.0, 0.0))
+    shown = tangents + np.stack([0.002 + 0.1 * tangents[:, 0], -0.001 + 0.2 * tangents[:, 1]], axis=-1)
+    np.testing.assert_allclose(found.field_tan, shown, atol=1e-8)
+    wanted = cloud.amplitude**2 * (0.6 + 0.8 * shown[:, 0] - 0.5 * shown[:, 1])
+    np.testing.assert_allclose(found.amplitude**2, wanted, rtol=1e-5)
+
+
+def test_zernike_maps_become_a_wavefront_over_the_field():
+    maps = {"correction.noll_4_rad": linear_map(0.3, 2.0, 0.0), "correction.noll_7_rad": linear_map(-0.1, 0.0, 1.0)}
+    found = corrections_of(accepted("aberration", maps, extent_deg=EXTENT, wavelength_nm=515.0), fov_rad=FOV)
+    tangents, pupil = np.array([[0.1, -0.05]]), np.array([[0.6e-3, -0.9e-3]])
+    phase = found.wavefront.phase(tangents, pupil, pupil_diameter_m=3e-3, wavelength_m=515e-9)
+    basis = zernike((4, 7), *(pupil / 1.5e-3).T)
+    assert phase[0] == pytest.approx((0.3 + 2.0 * 0.1) * basis[0, 0] + (-0.1 - 0.05) * basis[1, 0], abs=1e-6)
+
+
+def test_a_response_is_handed_to_the_levels():
+    phase = np.linspace(0, 5.9, 256)[None, :]
+    found = corrections_of(accepted("response", {PHASE: phase}), fov_rad=FOV)
+    np.testing.assert_allclose(found.response_rad, phase[0], atol=1e-6)
+
+
+def test_corrections_that_change_nothing_are_left_out_and_named():
+    nothing = (
+        accepted("uniformity", {WEIGHT: np.ones((4, 4))}, extent_deg=EXTENT)
+        | accepted("distortion", {name: np.zeros((4, 4)) for name in SHIFTS}, extent_deg=EXTENT)
+        | accepted("aberration", {"correction.noll_4_rad": np.zeros((4, 4))}, extent_deg=EXTENT, wavelength_nm=515.0)
+        | accepted("response", {PHASE: 2 * np.pi * np.arange(256)[None, :] / 256})
+    )
+    found = corrections_of(nothing, fov_rad=FOV)
+    assert found.identities == ("uniformity", "distortion", "aberration", "response")
+    cloud, _ = points()
+    assert found.apply(cloud, (0.0, 0.0)) is cloud
+    assert found.wavefront is None
+    assert found.response_rad is None
+
+
+@pytest.mark.parametrize("procedure", ["uniformity", "distortion", "aberration", "response"])
+def test_a_calibration_without_its_channels_is_refused_by_name(procedure):
+    with pytest.raises(InputError, match=f"the {procedure} calibration run"):
+        corrections_of(accepted(procedure, {"other": np.ones((2, 2))}), fov_rad=FOV)
+
+
+def test_without_accepted_corrections_a_cloud_is_unchanged():
+    cloud, _ = points()
+    assert corrections_of({}, fov_rad=FOV).apply(cloud, (0.0, 0.0)) is cloud
