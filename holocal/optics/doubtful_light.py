@@ -14,7 +14,6 @@ from holocal.optics.bench import Array
 from holocal.optics.free_space_kernel import padded_size, sampled_in_space, switch_distance
 
 DOUBTFUL_SHARE = 1e-4  # of the power: 1 % of the field
-_AXES = (("y", "rows"), ("x", "columns"))
 
 
 def warn_of_doubtful_light(
@@ -32,34 +31,26 @@ def warn_of_doubtful_light(
         Pitch (y, x), metres.
     """
     z = abs(distance_m)
-    for axis, in_space in enumerate(sampled_in_space(field.shape, steps, wavelength_m=wavelength_m, distance_m=z)):
-        if in_space:
-            continue
+    in_space = sampled_in_space(field.shape, steps, wavelength_m=wavelength_m, distance_m=z)
+    for axis in (axis for axis in (0, 1) if not in_space[axis]):
         n, step = int(field.shape[axis - 2]), steps[axis]
-        name, lines = _AXES[axis]
+        nearest = switch_distance(n, pitch_m=step, wavelength_m=wavelength_m)
         if 2 * step <= wavelength_m:
-            share = _share_beyond(field, axis - 2, step / wavelength_m)
-            if share > DOUBTFUL_SHARE:
-                warnings.warn(
-                    f"{share:.1e} of the power along {name} is evanescent, which is dropped; at {z:.3g} m, nearer than "
-                    f"two pitches of {step:.3g} m, some of it would arrive; the limit is {DOUBTFUL_SHARE:.0e}. "
-                    f"Use at least {2 * step:.3g} m.",
-                    SamplingWarning,
-                    stacklevel=3,
-                )
-            continue
-        # Order 1 of the pixels is as good a reading of the samples as order 0, and falls into the window when its
-        # sine, wavelength / pitch less its own, is below that of the window's far corner.
-        sine = n * step / sqrt((n * step) ** 2 + z * z)
-        edge = max(0.45, 1 - sine * step / wavelength_m)
-        share = _share_beyond(field, axis - 2, edge)
+            cycles = step / wavelength_m
+            doubt = "is evanescent: it is dropped, and some of it would arrive"
+            cure = "Use"
+        else:
+            # Order 1 of the pixels is as good a reading of the samples as order 0, and falls into the window when its
+            # sine, wavelength / pitch less its own, is below that of the window's far corner.
+            sine = n * step / sqrt((n * step) ** 2 + z * z)
+            cycles = max(0.45, 1 - sine * step / wavelength_m)
+            doubt = f"is within {1 - 2 * cycles:.1%} of the sampling limit: what is between the samples decides its way"
+            cure = "Sample finer, soften the edges over two pixels, or use"
+        share = _share_beyond(field, axis - 2, cycles)
         if share > DOUBTFUL_SHARE:
-            limit = switch_distance(n, pitch_m=step, wavelength_m=wavelength_m)
             warnings.warn(
-                f"{share:.1e} of the power is within {1 - 2 * edge:.1%} of the sampling limit along {name} "
-                f"({n} {lines} at {step:.3g} m): between the samples it could be anything, and at {z:.3g} m that "
-                f"decides what arrives; the limit is {DOUBTFUL_SHARE:.0e}. Sample finer, soften the edges over two "
-                f"pixels, or use more than {limit:.3g} m.",
+                f"{share:.1e} of the power along {'yx'[axis]} ({n} pixels of {step:.3g} m) {doubt} at {z:.3g} m; the "
+                f"limit is {DOUBTFUL_SHARE:.0e} of the power. {cure} more than {nearest:.3g} m.",
                 SamplingWarning,
                 stacklevel=3,
             )

@@ -1,6 +1,6 @@
 """The kernel of free space on a padded grid, each axis sampled where it is smooth: in space or in frequency.
 
-All four are one function, seen from either side of a Fourier transform: the Rayleigh-Sommerfeld impulse response
+All are one function, seen from either side of a Fourier transform: the Rayleigh-Sommerfeld impulse response
 h(y, x), the transfer function H(fy, fx), and between them, for panels that are longer than high, the two mixed ones
 h(y; fx) and h(fy; x), which are cylinder waves in closed form. It is even along both axes, so a quarter is kept.
 """
@@ -12,6 +12,7 @@ from math import fmod, pi, sqrt
 import numpy as np
 import scipy.fft
 import scipy.special
+import torch
 from numpy.typing import NDArray
 
 from holocal.optics.bench import Array
@@ -32,11 +33,11 @@ def switch_distance(n: int, *, pitch_m: float, wavelength_m: float) -> float:
 
     There a wave at the sampling limit 1 / (2 pitch) moves sideways by n pixels: n pitch sqrt((2 pitch / lambda)^2 - 1),
     which is `critical_distance` less the cosine of that wave. Below half a wavelength of pitch the impulse response is
-    sampled well everywhere but at its own peak, which is 2 pitches wide at a distance of 2 pitches: what it folds over
-    is then exp(-2 pi 2) = 3e-6.
+    sampled well everywhere but at its own peak: what that folds over is evanescent, and from 3 pitches on it is below
+    exp(-2 pi 3 sqrt(3/4)) = 8e-8.
     """
     slope = sqrt(max((2 * pitch_m / wavelength_m) ** 2 - 1, 0.0))
-    return max(n * pitch_m * slope, 2 * pitch_m)
+    return max(n * pitch_m * slope, 3 * pitch_m)
 
 
 def sampled_in_space(
@@ -85,7 +86,7 @@ def transfer_quadrant(
         kernel = _plane_waves(fx[None], fy[:, None], windows, wavelength_m=wavelength_m, distance_m=z)
     for axis in (0, 1):
         if in_space[axis]:  # a cosine transform of the first kind is the Fourier transform of the even whole
-            kernel = scipy.fft.dct(kernel, type=1, axis=axis, overwrite_x=True)
+            kernel = scipy.fft.dct(kernel, type=1, axis=axis, overwrite_x=True, workers=torch.get_num_threads())
     return np.conj(kernel) if distance_m < 0 else kernel
 
 

@@ -20,7 +20,7 @@ BLOCK_BYTES = 1 << 20  # half of a core's second-level cache, or all of it
 Spectrum = NDArray[Any]
 
 
-def convolve(field: torch.Tensor, quadrant: torch.Tensor) -> torch.Tensor:
+def convolve(field: torch.Tensor, quadrant: torch.Tensor, *, adjoint: bool = False) -> torch.Tensor:
     """Return the (..., rows, columns) field, padded with zeros, filtered, and cut back to its size.
 
     Parameters
@@ -30,19 +30,23 @@ def convolve(field: torch.Tensor, quadrant: torch.Tensor) -> torch.Tensor:
     quadrant
         (padded rows / 2 + 1, padded columns / 2 + 1): the filter at the frequencies 0 .. n/2; the others mirror it.
         Same type and device.
+    adjoint
+        Filter with the conjugate.
 
     Notes
     -----
-    Differentiable: the gradient goes through the adjoint, which is the filter's conjugate.
+    Differentiable with respect to the field: the gradient goes through the adjoint.
     """
     if field.device.type != "cpu":
-        return convolve_plainly(field, quadrant)
-    out: torch.Tensor = _Convolution.apply(field, quadrant)  # type: ignore[no-untyped-call]
+        return convolve_plainly(field, quadrant, adjoint=adjoint)
+    out: torch.Tensor = _Convolution.apply(field, quadrant, adjoint)  # type: ignore[no-untyped-call]
     return out
 
 
-def convolve_plainly(field: torch.Tensor, quadrant: torch.Tensor) -> torch.Tensor:
+def convolve_plainly(field: torch.Tensor, quadrant: torch.Tensor, *, adjoint: bool = False) -> torch.Tensor:
     """Return the same as `convolve` by two FFTs of the whole padded array, on any device."""
+    if adjoint:
+        quadrant = quadrant.conj()
     rows, columns = field.shape[-2:]
     high, wide = quadrant.shape[-2] - 1, quadrant.shape[-1] - 1
     whole = torch.cat([quadrant, quadrant[1:high].flip(0)])
@@ -55,21 +59,22 @@ class _Convolution(torch.autograd.Function):
     """The blocked convolution as a step that torch can differentiate."""
 
     @staticmethod
-    def forward(ctx: Any, field: torch.Tensor, quadrant: torch.Tensor) -> torch.Tensor:
+    def forward(ctx: Any, field: torch.Tensor, quadrant: torch.Tensor, adjoint: bool) -> torch.Tensor:
         ctx.save_for_backward(quadrant)
+        ctx.adjoint = adjoint
         fields = field.detach().resolve_conj().numpy().reshape(-1, *field.shape[-2:])
         out = np.empty_like(fields, order="C")
         for one, filtered in zip(fields, out, strict=True):
-            _filter(one, quadrant.detach().resolve_conj().numpy(), out=filtered)
+            _filter(one, quadrant.detach().resolve_conj().numpy(), adjoint=adjoint, out=filtered)
         return torch.from_numpy(out).reshape(field.shape)
 
     @staticmethod
-    def backward(ctx: Any, *grad_outputs: torch.Tensor) -> tuple[torch.Tensor, None]:
+    def backward(ctx: Any, *grad_outputs: torch.Tensor) -> tuple[torch.Tensor, None, None]:
         (quadrant,) = ctx.saved_tensors
-        return convolve(grad_outputs[0], quadrant.conj().resolve_conj()), None
+        return convolve(grad_outputs[0], quadrant, adjoint=not ctx.adjoint), None, None
 
 
-def _filter(field: Spectrum, quadrant: Spectrum, *, out: Spectrum) -> None:
+def _filter(field: Spectrum, quadrant: Spectrum, *, adjoint: bool, out: Spectrum) -> None:
     """Write the filtered (rows, columns) field to `out`."""
     rows, columns = field.shape
     high, wide = quadrant.shape[0] - 1, quadrant.shape[1] - 1
@@ -80,11 +85,12 @@ def _filter(field: Spectrum, quadrant: Spectrum, *, out: Spectrum) -> None:
 
     def filter_columns(start: int, stop: int) -> None:
         # the columns on the other side of 0 use the same part of the filter, mirrored, while it is near
+        part = np.conj(quadrant[:, start:stop]) if adjoint else quadrant[:, start:stop]
+        _filter_columns(spectrum[:, start:stop], part)
         first, last = max(start, 1), min(stop, wide)
-        _filter_columns(spectrum[:, start:stop], quadrant[:, start:stop])
         if first < last:
             mirrored = spectrum[:, 2 * wide - last + 1 : 2 * wide - first + 1]
-            _filter_columns(mirrored, quadrant[:, first:last][:, ::-1])
+            _filter_columns(mirrored, part[:, first - start : last - start][:, ::-1])
 
     def to_space(start: int, stop: int) -> None:
         block = scipy.fft.ifft(spectrum[start:stop], axis=1, norm="forward", overwrite_x=True)

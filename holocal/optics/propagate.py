@@ -50,7 +50,7 @@ def propagate(field: torch.Tensor, *, pitch_m: Pitch, wavelength_m: float, dista
     -----
     SamplingWarning
         Where no method can be right: nearer than the switch, and the field has light at the sampling limit, so that
-        what is between its samples decides; or nearer than two pitches, and it has evanescent light.
+        what is between its samples decides; or nearer than three fine pitches, and it has evanescent light.
 
     See Also
     --------
@@ -108,7 +108,7 @@ class Propagator:
 
     def adjoint(self, field: torch.Tensor) -> torch.Tensor:
         """Return the field that the adjoint of `forward` makes: the way back, for light that stayed in the window."""
-        return convolve(self._fitting(field), self.quadrant.conj().resolve_conj())
+        return convolve(self._fitting(field), self.quadrant, adjoint=True)
 
     def _fitting(self, field: torch.Tensor) -> torch.Tensor:
         _check(field)
