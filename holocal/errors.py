@@ -11,6 +11,8 @@ HolocalError                      (1)
 ├── DeviceError                   (6)  a device lost, silent or wrong
 ├── BusyError                     (75) the rig is in use by another process
 └── Interrupted                   (130) stopped by the operator
+
+SamplingWarning is no error: the result is the best there is, and its doubt is said.
 """
 
 from __future__ import annotations
@@ -93,6 +95,10 @@ class SamplingError(HolocalError):
 
     exit_status = 2
     default_code = "sampling"
+
+
+class SamplingWarning(UserWarning):
+    """A wave that its samples do not determine."""
 
 
 class StorageError(HolocalError):

@@ -1,38 +1,131 @@
-"""Free space from one plane to a parallel one: angular spectrum, impulse response, and the direct sum that judges them.
+"""Free space from one plane to a parallel one: the right kernel for each distance, and the direct sum that judges it.
 
 Time factor exp(-i w t): a wave along +z carries exp(+i k z). Fields are (..., rows, columns), row 0 on top, so x
 ascends with the column and y descends with the row; free space looks the same from both sides.
-Both fast methods pad to twice the size, so nothing wraps round, and return the field on the same pixels. A negative
+All fast methods pad to twice the size, so nothing wraps round, and return the field on the same pixels. A negative
 distance goes back, and is the adjoint.
+
+The field is one that its samples determine: nothing beyond the sampling limit 1 / (2 pitch). Beyond the switch
+distance, the pixels as points (`rayleigh_sommerfeld_sum`) give the same on all of the window, hard edges or not.
 """
 
 from __future__ import annotations
 
-from math import pi
+from dataclasses import dataclass
+from math import isfinite, pi
 
 import numpy as np
 import torch
 
 from holocal.errors import SamplingError, UsageError
 from holocal.optics.bench import Array
+from holocal.optics.doubtful_light import warn_of_doubtful_light
+from holocal.optics.free_space_kernel import (
+    padded_size,
+    rayleigh_sommerfeld_kernel,
+    sampled_in_space,
+    transfer_quadrant,
+)
+from holocal.optics.padded_convolution import convolve
 
 Pitch = float | tuple[float, float]
 
 
 def propagate(field: torch.Tensor, *, pitch_m: Pitch, wavelength_m: float, distance_m: float) -> torch.Tensor:
-    """Return the field `distance_m` further, by the method whose kernel the padded grid can hold.
+    """Return the field `distance_m` further, each axis by the kernel that the padded grid can hold.
 
-    The angular spectrum up to the `critical_distance`, the impulse response beyond.
+    The angular spectrum up to the `critical_distance`, the impulse response beyond, and between the two axes' own
+    critical distances the mixed kernel: impulse response along the short axis, angular spectrum along the long one.
+
+    Parameters
+    ----------
+    field
+        (..., rows, columns) complex64 or complex128; the result has its type and device.
+    pitch_m
+        Pixel pitch, one number or (along rows' y, along columns' x).
+    wavelength_m, distance_m
+        Metres; the distance may be negative, which is the adjoint, or 0, which changes nothing.
+
+    Warns
+    -----
+    SamplingWarning
+        Where no method can be right: nearer than the switch, and the field has light at the sampling limit, so that
+        what is between its samples decides; or nearer than three fine pitches, and it has evanescent light.
+
+    See Also
+    --------
+    Propagator : The same, prepared once for many fields; it does not look for doubtful light.
     """
-    limit = critical_distance(field.shape[-2:], pitch_m=pitch_m, wavelength_m=wavelength_m)
-    method = angular_spectrum if abs(distance_m) <= limit else impulse_response
-    return method(field, pitch_m=pitch_m, wavelength_m=wavelength_m, distance_m=distance_m)
+    _check(field)
+    steps = _steps(pitch_m, wavelength_m)
+    _check_distance(distance_m)
+    if distance_m == 0:
+        return field.clone()
+    warn_of_doubtful_light(field, steps, wavelength_m=wavelength_m, distance_m=distance_m)
+    propagator = Propagator.prepare(
+        field.shape, pitch_m=pitch_m, wavelength_m=wavelength_m, distance_m=distance_m, like=field
+    )
+    return propagator.forward(field)
+
+
+@dataclass(frozen=True)
+class Propagator:
+    """Free space of one length for fields of one size: what `propagate` does, prepared.
+
+    Attributes
+    ----------
+    shape
+        (rows, columns) of its fields.
+    quadrant
+        What the padded field's frequencies 0 .. n/2 are multiplied by; 66 MB for 2160 x 3840 in complex64.
+    """
+
+    shape: tuple[int, int]
+    quadrant: torch.Tensor
+
+    @classmethod
+    def prepare(
+        cls,
+        shape: torch.Size | tuple[int, ...],
+        *,
+        pitch_m: Pitch,
+        wavelength_m: float,
+        distance_m: float,
+        like: torch.Tensor | None = None,
+    ) -> Propagator:
+        """Return the propagator for the last two sizes of `shape`, of the type and device of `like` (complex64, CPU).
+
+        Errors as in `propagate`.
+        """
+        steps = _steps(pitch_m, wavelength_m)
+        _check_distance(distance_m)
+        in_space = sampled_in_space(shape, steps, wavelength_m=wavelength_m, distance_m=distance_m)
+        return _prepared(shape, steps, in_space, wavelength_m=wavelength_m, distance_m=distance_m, like=like)
+
+    def forward(self, field: torch.Tensor) -> torch.Tensor:
+        """Return the (..., rows, columns) field at the distance."""
+        return convolve(self._fitting(field), self.quadrant)
+
+    def adjoint(self, field: torch.Tensor) -> torch.Tensor:
+        """Return the field that the adjoint of `forward` makes: the way back, for light that stayed in the window."""
+        return convolve(self._fitting(field), self.quadrant, adjoint=True)
+
+    def _fitting(self, field: torch.Tensor) -> torch.Tensor:
+        _check(field)
+        if tuple(field.shape[-2:]) != self.shape or field.dtype != self.quadrant.dtype:
+            raise UsageError(
+                f"A field of {tuple(field.shape)} {field.dtype}; the propagator is for {self.shape} "
+                f"{self.quadrant.dtype}.",
+                fix="Prepare a propagator like this field.",
+            )
+        return field
 
 
 def critical_distance(shape: torch.Size | tuple[int, ...], *, pitch_m: Pitch, wavelength_m: float) -> float:
     """Return z_c = N pitch^2 / wavelength, N being the padded size, the smaller one of the two axes.
 
-    Below it the transfer function is the smoother kernel, beyond it the impulse response.
+    Below it the transfer function is the smoother kernel, beyond it the impulse response. `propagate` switches each
+    axis at its own, less the cosine that this leaves out (0.2 % at 3.74 um and 515 nm).
     """
     steps = _steps(pitch_m, wavelength_m)
     return min(2 * n * step * step / wavelength_m for n, step in zip(shape[-2:], steps, strict=True))
@@ -43,42 +136,20 @@ def angular_spectrum(field: torch.Tensor, *, pitch_m: Pitch, wavelength_m: float
 
     Each plane wave is multiplied by exp(+i 2 pi z sqrt(1/lambda^2 - fx^2 - fy^2)); evanescent ones are dropped, and
     so are those whose phase changes by more than pi between neighbouring frequencies: their light leaves the padded
-    window.
-
-    Parameters
-    ----------
-    field
-        (..., rows, columns) complex64 or complex128; the result has its type and device.
-    pitch_m
-        Pixel pitch, one number or (along rows' y, along columns' x).
-    wavelength_m, distance_m
-        Metres; the distance may be negative.
+    window. Parameters as in `propagate`.
     """
-    steps = _steps(pitch_m, wavelength_m)
-    rows, columns = (2 * n for n in field.shape[-2:])
-    fy, fx = np.fft.fftfreq(rows, steps[0])[:, None], np.fft.fftfreq(columns, steps[1])[None, :]
-    square = wavelength_m**-2 - fx * fx - fy * fy
-    turns = distance_m * np.sqrt(np.maximum(square, 0.0))
-    kept = square > 0
-    for f, n, step in ((fy, rows, steps[0]), (fx, columns, steps[1])):
-        # local frequency z |f| / sqrt(square) of the transfer function against half the padded window, n step / 2
-        kept = kept & (np.abs(f * distance_m) <= np.sqrt(np.maximum(square, 0.0)) * (n * step / 2))
-    return _convolve(field, _phasor(turns, field) * _real(kept, field))
+    return _by_one_method(field, pitch_m, False, wavelength_m=wavelength_m, distance_m=distance_m)
 
 
 def impulse_response(field: torch.Tensor, *, pitch_m: Pitch, wavelength_m: float, distance_m: float) -> torch.Tensor:
     """Return the field `distance_m` further, by padded convolution with the Rayleigh-Sommerfeld kernel.
 
     The same sum as `rayleigh_sommerfeld_sum`, in N log N: for distances where the kernel is sampled well (beyond
-    `critical_distance`). Parameters as in `angular_spectrum`; the distance is not 0.
+    `critical_distance`). Parameters as in `propagate`; the distance is not 0.
     """
-    steps = _steps(pitch_m, wavelength_m)
-    rows, columns = (2 * n for n in field.shape[-2:])
-    y = np.asarray(np.fft.fftfreq(rows, 1 / (rows * steps[0])))[:, None]  # 0, 1, .. -1 steps
-    x = np.asarray(np.fft.fftfreq(columns, 1 / (columns * steps[1])))[None, :]
-    amplitude, turns = _kernel(x, y, wavelength_m=wavelength_m, distance_m=distance_m)
-    kernel = _phasor(turns, field) * _real(amplitude * (steps[0] * steps[1]), field)
-    return _convolve(field, torch.fft.fft2(kernel))
+    if distance_m == 0:
+        raise UsageError("The Rayleigh-Sommerfeld kernel has no distance 0.", fix="Use angular_spectrum.")
+    return _by_one_method(field, pitch_m, True, wavelength_m=wavelength_m, distance_m=distance_m)
 
 
 def rayleigh_sommerfeld_sum(
@@ -93,6 +164,8 @@ def rayleigh_sommerfeld_sum(
     points_m
         (n, 2) of x (to the right) and y (up), metres from the centre of the aperture.
     """
+    if distance_m == 0:
+        raise UsageError("The Rayleigh-Sommerfeld kernel has no distance 0.", fix="The field is its own.")
     steps = _steps(pitch_m, wavelength_m)
     rows, columns = field.shape[-2:]
     y = ((rows - 1) / 2 - np.arange(rows)) * steps[0]
@@ -101,47 +174,66 @@ def rayleigh_sommerfeld_sum(
     out = np.empty(len(points_m), np.complex128)
     for i, (px, py) in enumerate(points_m):
         away_x, away_y = (px - x)[None, :], (py - y)[:, None]
-        amplitude, turns = _kernel(away_x, away_y, wavelength_m=wavelength_m, distance_m=distance_m)
+        amplitude, turns = rayleigh_sommerfeld_kernel(away_x, away_y, wavelength_m=wavelength_m, distance_m=distance_m)
         out[i] = np.sum(source * amplitude * np.exp(2j * pi * (turns - np.round(turns))))
     return torch.from_numpy(out * (steps[0] * steps[1]))
 
 
-def _kernel(x: Array, y: Array, *, wavelength_m: float, distance_m: float) -> tuple[Array, Array]:
-    """Return modulus and phase (turns) of the first Rayleigh-Sommerfeld kernel z / (2 pi r^2) (1/r - ik) exp(ikr).
-
-    For a negative distance its conjugate, which goes back.
-    """
-    if distance_m == 0:
-        raise UsageError("The Rayleigh-Sommerfeld kernel has no distance 0.", fix="Use angular_spectrum.")
-    r = np.sqrt(x * x + y * y + distance_m * distance_m)
-    k = 2 * pi / wavelength_m
-    amplitude = abs(distance_m) / (2 * pi * r * r) * np.hypot(1 / r, k)
-    turns = r / wavelength_m - np.arctan2(k, 1 / r) / (2 * pi)
-    return amplitude, np.sign(distance_m) * turns
+def _by_one_method(
+    field: torch.Tensor, pitch_m: Pitch, in_space: bool, *, wavelength_m: float, distance_m: float
+) -> torch.Tensor:
+    """Return the field by the impulse response (`in_space`) or by the angular spectrum along both axes."""
+    _check(field)
+    steps = _steps(pitch_m, wavelength_m)
+    _check_distance(distance_m)
+    keys = {"wavelength_m": wavelength_m, "distance_m": distance_m}
+    return _prepared(field.shape, steps, (in_space, in_space), **keys, like=field).forward(field)
 
 
-def _convolve(field: torch.Tensor, transfer: torch.Tensor) -> torch.Tensor:
-    """Return the field, padded to the transfer function's size, filtered by it, and cut back."""
-    rows, columns = field.shape[-2:]
-    size = (int(transfer.shape[-2]), int(transfer.shape[-1]))
-    out: torch.Tensor = torch.fft.ifft2(torch.fft.fft2(field, s=size) * transfer)[..., :rows, :columns]
-    return out
-
-
-def _phasor(turns: Array, like: torch.Tensor) -> torch.Tensor:
-    """Return exp(2 pi i turns) in the type of `like`: reduced in float64, cast once."""
-    reduced = _real(2 * pi * (turns - np.round(turns)), like)
-    return torch.polar(torch.ones_like(reduced), reduced)
-
-
-def _real(values: Array | np.ndarray[tuple[int, ...], np.dtype[np.bool_]], like: torch.Tensor) -> torch.Tensor:
-    real = torch.float64 if like.dtype == torch.complex128 else torch.float32
-    return torch.from_numpy(np.ascontiguousarray(values)).to(device=like.device, dtype=real)
+def _prepared(
+    shape: torch.Size | tuple[int, ...],
+    steps: tuple[float, float],
+    in_space: tuple[bool, bool],
+    *,
+    wavelength_m: float,
+    distance_m: float,
+    like: torch.Tensor | None,
+) -> Propagator:
+    """Return the propagator whose kernel is sampled in space along the given axes (y, x): float64, cast once."""
+    rows, columns = shape[-2:]
+    if min(rows, columns) < 1:
+        raise UsageError(f"A field of {rows} x {columns} pixels has no light.")
+    quadrant = transfer_quadrant(
+        (padded_size(rows), padded_size(columns)),
+        steps_m=steps,
+        wavelength_m=wavelength_m,
+        distance_m=distance_m,
+        in_space=in_space,
+    )
+    dtype, device = (torch.complex64, None) if like is None else (like.dtype, like.device)
+    return Propagator((rows, columns), torch.from_numpy(np.ascontiguousarray(quadrant)).to(device=device, dtype=dtype))
 
 
 def _steps(pitch_m: Pitch, wavelength_m: float) -> tuple[float, float]:
     """Return the pitch (y, x), checked."""
     steps = pitch_m if isinstance(pitch_m, tuple) else (pitch_m, pitch_m)
-    if not (min(steps) > 0 and wavelength_m > 0):
-        raise SamplingError(f"Pitch {steps} m and wavelength {wavelength_m} m must be above 0.")
+    if not all(isfinite(size) and size > 0 for size in (*steps, wavelength_m)):
+        raise SamplingError(f"Pitch {steps} m and wavelength {wavelength_m} m must be finite and above 0.")
     return steps
+
+
+def _check(field: torch.Tensor) -> None:
+    """Refuse what is no field."""
+    if field.ndim < 2 or field.dtype not in (torch.complex64, torch.complex128):
+        raise UsageError(
+            f"A field is (..., rows, columns), complex64 or complex128, not {tuple(field.shape)} {field.dtype}."
+        )
+
+
+def _check_distance(distance_m: float) -> None:
+    """Refuse a distance that no kernel has."""
+    if not isfinite(distance_m):
+        raise UsageError(
+            f"A distance of {distance_m} m has no plane with the same pixels.",
+            fix="The far field is the Fourier transform: torch.fft.fft2(field, norm='ortho').",
+        )

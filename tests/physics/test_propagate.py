@@ -121,6 +121,7 @@ def test_propagation_agrees_with_the_direct_sum(z):
     assert relative(out[rows, columns], exact) < 1e-5
 
 
+@pytest.mark.filterwarnings("ignore::holocal.errors.SamplingWarning")  # a point has light at every frequency
 def test_the_method_changes_at_the_critical_distance():
     start = torch.zeros((64, 64), dtype=torch.complex128)
     start[30, 35] = 1
