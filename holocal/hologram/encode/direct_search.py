@@ -1,9 +1,9 @@
 """Direct binary search, generalised from 2 to any number of levels (Seldowitz, Allebach & Sweeney, Appl. Opt. 26:2788).
 
-With e = A^H (A u - s wanted) and p the square of the norm of A on one pixel, changing pixel j by d changes the squared error
-by p |d|^2 + 2 Re(conj(d) e_j). On the circle that is a constant less 2 Re(conj(u'_j) (p u_j - e_j)): the best phase is that of
-p u_j - e_j, the best level the nearest to it, and nothing has to be tried. Pixels on a lattice so wide that A^H A hardly
-couples them are changed together; then e is made again through the transform.
+With e = A^H (A u - s wanted) and p the squared norm of A on one pixel, changing pixel j by d changes the squared error
+by p |d|^2 + 2 Re(conj(d) e_j). On the circle that is a constant less 2 Re(conj(u'_j) (p u_j - e_j)): the best phase is
+that of p u_j - e_j, the best level the nearest to it, and nothing has to be tried. Pixels on a lattice so wide that
+A^H A hardly couples them are changed together; then e is made again through the transform.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ class _Search:
     def begin(cls, settings: DirectSearch, target: Target) -> _Search:
         wanted, start = target.wanted * target.window, own_phase(target.start)
         field = start if settings.levels is None else settings.levels.nearest(start)
-        empty = Misfit(wanted, 0.0, 0.0)
+        empty = Misfit(wanted, 0.0, 0.0, 0.0)
         search = cls(settings, target, wanted, on_one_pixel(target), field, empty)
         search.misfit = search.measure()
         return search

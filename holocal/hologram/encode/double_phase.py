@@ -1,8 +1,9 @@
 """Double-phase amplitude coding: two neighbours, turned apart, have the wanted value as their mean.
 
-c exp(i phi) = (exp(i (phi + t)) + exp(i (phi - t))) / 2 with t = arccos c (Hsueh & Sawchuk, Appl. Opt. 17:3874, 1978). On a
-checkerboard the field is c exp(i phi) plus i sqrt(1 - c^2) exp(i phi) times +-1, which moves that second field to the
-corner of the band: what of it reaches back into the window is the error.
+c exp(i phi) = (exp(i (phi + t)) + exp(i (phi - t))) / 2 with t = arccos c (Hsueh & Sawchuk, Appl. Opt. 17:3874, 1978).
+On a checkerboard the field is c exp(i phi) plus i sqrt(1 - c^2) exp(i phi) times +-1, which moves that second field to
+the corner of the band: what of it reaches back into the window is the error. Taking that off the hologram and coding
+again does not help (measured, 10 times: 0.164 became 0.224 at a fifth of the light, 0.166 became 0.156 at half).
 """
 
 from __future__ import annotations

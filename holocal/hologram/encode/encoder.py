@@ -11,7 +11,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import torch
@@ -66,21 +66,48 @@ class Encoder(Protocol):
 
 
 @dataclass(frozen=True)
+class Then:
+    """One encoder after another, from the field that the first one made.
+
+    Examples
+    --------
+    >>> from holocal.hologram.encode.error_diffusion import ErrorDiffusion
+    >>> from holocal.hologram.encode.gradient_descent import GradientDescent
+    >>> polished = Then(ErrorDiffusion(light=0.2), GradientDescent(iterations=3, light=0.2))
+    """
+
+    first: Encoder
+    second: Encoder
+
+    def __call__(self, target: Target) -> Encoded:
+        """Return the second one's field, with the errors of both."""
+        begun = self.first(target)
+        found = self.second(replace(target, start=begun.field))
+        return replace(found, signal_error=begun.signal_error + found.signal_error)
+
+
+@dataclass(frozen=True)
 class Misfit:
     """A spectrum against what is asked of it.
 
-    `excess` is what must be taken away to come to the nearest spectrum that is good; `signal` the power of that
-    nearest one; `inside` the power in the window; `error` the rms of `excess` over the rms of the nearest.
+    `excess` is what must be taken away to come to a better one; `squared` the power of the error; `signal` that of the
+    nearest good spectrum; `inside` that in the window.
     """
 
     excess: torch.Tensor
+    squared: float
     signal: float
     inside: float
 
     @property
     def error(self) -> float:
         """Return the rms error over the rms signal."""
-        return float((power(self.excess) / max(self.signal, _TINY)) ** 0.5)
+        return float(relative(self.squared, self.signal) ** 0.5)
+
+
+def relative(squared: float, signal: float) -> float:
+    """Return the power of an error over that of the signal; huge, not infinite, where there is no signal."""
+    return squared / max(signal, _TINY)
 
 
 def power(spectrum: torch.Tensor) -> float:
@@ -96,7 +123,11 @@ def masked(spectrum: torch.Tensor, window: torch.Tensor) -> torch.Tensor:
 
 
 def window_misfit(found: torch.Tensor, wanted: torch.Tensor, signal: float | None) -> Misfit:
-    """Return found - s wanted, in the memory of `found`.
+    """Return how far a spectrum is from s wanted, in the memory of `found`.
+
+    The excess is the gradient of half the squared error if s is given. If s is what fits best, it is that of the
+    relative squared error, times half the signal's power: found - s (1 + error^2) wanted. Without the second term all
+    light leaves the window when the wanted field cannot be had: measured, 0.4 % left after 50 iterations.
 
     Parameters
     ----------
@@ -106,11 +137,12 @@ def window_misfit(found: torch.Tensor, wanted: torch.Tensor, signal: float | Non
         The power that s wanted shall have; None takes the real s that fits best.
     """
     full, inside = max(power(wanted), _TINY), power(found)
+    fits = float(torch.vdot(wanted.flatten(), found.flatten()).real) / full
+    scale = fits if signal is None else (signal / full) ** 0.5
+    squared, asked = power(found.sub_(wanted, alpha=scale)), scale * scale * full
     if signal is None:
-        scale = float(torch.vdot(wanted.flatten(), found.flatten()).real) / full
-    else:
-        scale = (signal / full) ** 0.5
-    return Misfit(found.sub_(wanted, alpha=scale), scale * scale * full, inside)
+        found.sub_(wanted, alpha=scale * relative(squared, asked) if scale else 0.0)
+    return Misfit(found, squared, asked, inside)
 
 
 def assess(field: torch.Tensor, target: Target, errors: tuple[float, ...] = ()) -> Encoded:

@@ -1,4 +1,4 @@
-"""Error diffusion of a complex field: what a pixel cannot show, its neighbours make up for (thesis 3.1, an alternative).
+"""Error diffusion of a complex field: what a pixel cannot show, its neighbours make up for (thesis 3.1).
 
 u = g / |g| with g = s h + sum_k w_k e_k over the neighbours before it, e = g - u. Then u = s h - (e - sum w_k e_k): the
 error appears in the spectrum multiplied by 1 - W(f), W(f) = sum_k w_k exp(-2 pi i f.k), a factor that the weights make
@@ -102,7 +102,7 @@ class ErrorDiffusion:
 
 def diffused(hologram: torch.Tensor, weights: Weights, levels: Levels | None = None) -> torch.Tensor:
     """Return the phasors of a hologram (rows, columns) complex64 whose modulus is mostly below 1; in its memory."""
-    work = _Work.of(np.ascontiguousarray(hologram.numpy()), weights)
+    work = _Work.of(hologram.contiguous().numpy(), weights)
     beside = None if levels is None or levels.beside_rad is None else levels.beside_rad.cpu().numpy()
     for step in range(work.steps):
         chosen, part = work.wanted(step)
@@ -118,7 +118,7 @@ class _Work:
     one product with the weights per row distance. Lines have `margin` zeros before row 0.
     """
 
-    pixels: NDArray[np.complex64]
+    pixels: NDArray[np.complex64]  # flat
     rows: int
     columns: int
     skew: int
@@ -144,10 +144,8 @@ class _Work:
         lines = skew * depth + reach + 1
         errors = np.zeros((2 * lines, 2 * (rows + depth)), np.float32)
         scratch = tuple(np.zeros(rows, np.complex64) for _ in range(3))
-        steps_free = hologram.reshape(-1)
-        return cls(
-            steps_free, rows, columns, skew, taps, errors, lines, depth, scratch, np.empty(rows, np.float32)
-        )
+        modulus = np.empty(rows, np.float32)
+        return cls(hologram.reshape(-1), rows, columns, skew, taps, errors, lines, depth, scratch, modulus)
 
     @property
     def steps(self) -> int:
@@ -157,7 +155,7 @@ class _Work:
     def wanted(self, step: int) -> tuple[NDArray[np.complex64], slice]:
         """Return g of a diagonal, and its rows."""
         first = max(0, -((self.columns - 1 - step) // self.skew))
-        part = slice(first, min(self.rows, step // self.skew + 1))
+        part = slice(first, max(first, min(self.rows, step // self.skew + 1)))  # empty now and then on a narrow panel
         value, product = self.scratch[0][part], self.scratch[1][part].view(np.float32)
         np.copyto(value, self.diagonal(step, part))
         parts = value.view(np.float32)
@@ -172,9 +170,8 @@ class _Work:
     def diagonal(self, step: int, part: slice) -> NDArray[np.complex64]:
         """Return the pixels (r, step - skew r) of some rows, a view."""
         start = part.start * self.columns + step - self.skew * part.start
-        stride = self.columns - self.skew
-        strides = (stride * self.pixels.itemsize,)
-        return np.lib.stride_tricks.as_strided(self.pixels[start:], (part.stop - part.start,), strides)
+        stride = max(self.columns - self.skew, 1)  # a panel as narrow as the skew has one pixel per diagonal
+        return self.pixels[start : max(start, start + stride * (part.stop - part.start - 1) + 1) : stride]
 
     def settle(self, step: int, part: slice, phasors: NDArray[np.complex64]) -> None:
         """Write a diagonal's phasors and the error that they make."""
@@ -207,8 +204,8 @@ def _phasors(
         out.real, out.imag = np.cos(phase), np.sin(phase)
         return out
     np.abs(value, out=modulus)
-    dark = modulus < _TINY
-    if dark.any():
+    if modulus.size and modulus.min() < _TINY:
+        dark = modulus < _TINY
         value = np.where(dark, np.complex64(1), value)
         modulus[dark] = 1
     np.reciprocal(modulus, out=modulus)
