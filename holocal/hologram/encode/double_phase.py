@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import torch
 
-from holocal.hologram.encode.encoder import Target, assess, own_phase, scaled
+from holocal.hologram.encode.encoder import Target, assess, in_window, own_phase
 from holocal.hologram.encode.ifta import Encoded
 
 
@@ -27,11 +27,11 @@ class DoublePhase:
         brighter, less exact.
     """
 
-    light: float = 0.35  # least error in the window of the thesis's bench: 0.14
+    light: float = 0.35
 
     def __call__(self, target: Target) -> Encoded:
         """Return the checkerboard."""
-        return assess(double_phase(scaled(target.start, self.light)), target)
+        return assess(double_phase(in_window(target, self.light)), target)
 
 
 def double_phase(hologram: torch.Tensor) -> torch.Tensor:

@@ -11,6 +11,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -20,6 +21,7 @@ from holocal.hologram.encode.ifta import Encoded
 from holocal.optics.bench import Array
 
 _TINY = 1e-30
+_BLOCK = 64  # rows at a time: 2 MB at 4K
 
 
 class Transform(Protocol):
@@ -159,6 +161,15 @@ def scaled(hologram: torch.Tensor, light: float) -> torch.Tensor:
     return hologram * ((light / mean) ** 0.5 if mean > 0 else 1.0)
 
 
+def in_window(target: Target, light: float) -> torch.Tensor:
+    """Return the hologram without what lies outside the window, its mean squared modulus `light`.
+
+    What an encoder of one pass should code: of a 4K hologram 0.18 of the light lies between the pupil's round image and
+    the compact spectrum's corners.
+    """
+    return scaled(target.transform.adjoint(target.wanted * target.window), light)
+
+
 def own_phase(hologram: torch.Tensor) -> torch.Tensor:
     """Return a new field of unit modulus with the hologram's phase; 1 where the hologram is 0."""
     return to_unit(hologram.clone())
@@ -166,12 +177,22 @@ def own_phase(hologram: torch.Tensor) -> torch.Tensor:
 
 def to_unit(field: torch.Tensor) -> torch.Tensor:
     """Divide a complex field by its modulus in place, and return it; 0 becomes 1."""
+    for part in blocks(len(field)):
+        _block_to_unit(field[part])
+    return field
+
+
+def blocks(rows: int) -> Iterator[slice]:
+    """Return slices of rows so small that work on them stays in the cache."""
+    return (slice(top, min(top + _BLOCK, rows)) for top in range(0, rows, _BLOCK))
+
+
+def _block_to_unit(field: torch.Tensor) -> None:
     parts = torch.view_as_real(field)
     real, imaginary = parts[..., 0], parts[..., 1]
     square = torch.mul(real, real).addcmul_(imaginary, imaginary)
-    dark = square < _TINY
-    if bool(dark.any()):
+    if square.numel() and float(square.min()) < _TINY:
+        dark = square < _TINY
         field[dark] = 1
         square[dark] = 1
     parts.mul_(square.rsqrt_().unsqueeze(-1))
-    return field

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 import torch
 
-from holocal.hologram.encode.encoder import Misfit, Target, masked, own_phase, to_unit
+from holocal.hologram.encode.encoder import Misfit, Target, blocks, masked, own_phase, to_unit
 from holocal.hologram.encode.goals import FieldGoal, Goal
 from holocal.hologram.encode.ifta import Encoded
 
@@ -48,12 +48,15 @@ class GradientDescent:
         before, errors = now.clone(), []
         wanted = target.wanted * target.window
         for _ in range(self.iterations):
-            # before + (1 + momentum) (now - before), in the memory of `before`
-            ahead = to_unit(torch.lerp(before, now, 1 + self.momentum, out=before))
+            ahead = before  # its memory
+            for part in blocks(len(now)):
+                to_unit(ahead[part].lerp_(now[part], 1 + self.momentum))
             misfit = self._misfit(ahead, wanted, target)
             errors.append(misfit.error)
-            ahead.sub_(target.transform.adjoint(misfit.excess), alpha=self.step)
-            before, now = now, to_unit(ahead)
+            excess = target.transform.adjoint(misfit.excess)
+            for part in blocks(len(now)):
+                to_unit(ahead[part].sub_(excess[part], alpha=self.step))
+            before, now = now, ahead
         misfit = self._misfit(now, wanted, target, at_its_best=True)
         pixels = now.numel()
         return Encoded(now, misfit.signal / pixels, misfit.inside / pixels, (*errors, misfit.error))
