@@ -19,6 +19,9 @@ from holocal.hologram.encode.goals import CameraGoal, FieldGoal, ModulusGoal, pi
 from holocal.hologram.encode.gradient_descent import GradientDescent
 from holocal.hologram.encode.ifta_encoder import Ifta
 from holocal.hologram.encode.levels import Levels
+from holocal.hologram.frame import panel_phase, phase_to_levels
+from holocal.hologram.series import Series
+from holocal.optics.bench import Panel
 
 ENCODERS = [
     Ifta(6),
@@ -151,17 +154,30 @@ def test_a_dark_corner_is_diffused_too():
     assert np.abs(diffused(hologram.clone(), FLOYD_STEINBERG).numpy() - wanted).max() < 2e-3
 
 
-def test_the_error_of_diffusion_is_the_spectrum_of_one_minus_the_weights():
-    # u = h - (e - w * e): with e recovered by running the recursion, the identity holds at every pixel
-    hologram, weights = (0.4 * complex_noise(16, 21, 4)).numpy().astype(complex), ASYMMETRIC
-    out = diffused_pixel_by_pixel(hologram, weights)
-    error, table = np.zeros((18, 25), complex), weights.table().astype(float)
+def test_the_error_of_diffusion_is_shaped_by_one_minus_the_weights():
+    # u - h = -(e - w * e): in the spectrum (no pixel's error may be lost over the edge) -E(f) (1 - W(f))
+    hologram = np.zeros((40, 60), complex)
+    hologram[:16, 8:29] = 0.4 * complex_noise(16, 21, 4).numpy()
+    out = diffused_pixel_by_pixel(hologram[:16, 8:29], ASYMMETRIC)
+    table, error = ASYMMETRIC.table().astype(float), np.zeros((40, 60), complex)
+    taken_over = np.zeros((40, 60), complex)
     for r in range(16):
-        for c in range(21):
-            passed_on = sum(table[d, k] * error[r - d + 2, c - k + 4] for d in range(3) for k in range(5))
-            error[r + 2, c + 2] = hologram[r, c] + passed_on - out[r, c]
-    assert np.abs(np.abs(error[2:, 2:-2] + out) - np.abs(np.abs(error[2:, 2:-2] + out))).max() == 0
-    assert np.abs(np.angle((error[2:, 2:-2] + out) * out.conj())).max() < 1e-9
+        for c in range(8, 29):
+            value = hologram[r, c] + taken_over[r, c]
+            error[r, c] = value - out[r, c - 8]
+            for down in range(3):
+                for k in range(5):
+                    taken_over[r + down, c + k - 2] += table[down, k] * error[r, c]
+    shown = np.zeros((40, 60), complex)
+    shown[:16, 8:29] = out
+    kernel = np.zeros((40, 60))
+    for down in range(3):
+        for k in range(5):
+            kernel[down, k - 2] = table[down, k]
+    lost = taken_over.copy()
+    lost[:16, 8:29] = 0  # what the panel's edge swallows
+    left = np.fft.fft2(shown - hologram + lost)
+    assert np.allclose(left, -np.fft.fft2(error) * (1 - np.fft.fft2(kernel)), atol=1e-8)
 
 
 def test_fitted_weights_leave_less_noise_in_the_window_than_floyd_and_steinbergs():
@@ -205,6 +221,17 @@ def test_levels_are_nearest_with_the_reference_counted_in():
     assert float((shown - field).abs().max()) <= 2 * np.sin(np.pi / 32) + 1e-5
     part = (slice(1, None, 2), slice(0, None, 3))
     assert torch.equal(levels.nearest(field[part], *part), shown[part])
+
+
+def test_levels_in_front_of_a_reference_come_through_the_frame_unchanged():
+    panel = Panel(40, 30, 4e-6)
+    reference = Series(np.array([[0.3, 2.1], [-1.7, 0.4]]), (0.0, 0.0), (80e-6, 60e-6))
+    beside = torch.from_numpy(panel_phase(torch.ones((30, 40), dtype=torch.complex64), reference, panel))
+    levels = Levels(256, beside)
+    field = levels.nearest(to_unit(complex_noise(30, 40, 9)))
+    frame = phase_to_levels(panel_phase(field, reference, panel))
+    shown = np.exp(1j * (2 * np.pi / 256 * frame.astype(float) - beside.numpy()))
+    assert np.abs(shown - field.numpy()).max() < 1e-4  # half a level is 0.012
 
 
 @pytest.mark.parametrize("kind", ["search", "diffusion"])

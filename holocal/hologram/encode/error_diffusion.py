@@ -105,7 +105,7 @@ def diffused(hologram: torch.Tensor, weights: Weights, levels: Levels | None = N
     work = _Work.of(hologram.contiguous().numpy(), weights)
     beside = None if levels is None or levels.beside_rad is None else levels.beside_rad.cpu().numpy()
     for step in range(work.steps):
-        chosen, part = work.wanted(step)
+        chosen, part = work.asked(step)
         work.settle(step, part, _phasors(chosen, work, part, levels, beside, step))
     return torch.from_numpy(work.pixels.reshape(hologram.shape))
 
@@ -152,7 +152,7 @@ class _Work:
         """Return how many diagonals there are."""
         return self.columns + self.skew * (self.rows - 1) if self.columns else 0
 
-    def wanted(self, step: int) -> tuple[NDArray[np.complex64], slice]:
+    def asked(self, step: int) -> tuple[NDArray[np.complex64], slice]:
         """Return g of a diagonal, and its rows."""
         first = max(0, -((self.columns - 1 - step) // self.skew))
         part = slice(first, max(first, min(self.rows, step // self.skew + 1)))  # empty now and then on a narrow panel
