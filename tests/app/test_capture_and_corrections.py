@@ -76,16 +76,18 @@ def points(gaze: tuple[float, float] = (0.0, 0.0)) -> tuple[PointCloud, np.ndarr
     """Return points inside EXTENT, and their tangents as the eye sees them, gaze or not."""
     rng = np.random.default_rng(1)
     tangents = rng.uniform(-0.15, 0.15, (80, 2))
-    directions = np.concatenate([tangents, np.ones((80, 1))], axis=1) @ Bench().pupil_axes(gaze)  # into the gaze's frame
-    cloud = PointCloud(directions[:, :2] / directions[:, 2:], np.full(80, np.inf), rng.uniform(0.2, 1, 80), np.zeros(80))
+    directions = np.concatenate([tangents, np.ones((80, 1))], axis=1) @ Bench().pupil_axes(
+        gaze
+    )  # into the gaze's frame
+    cloud = PointCloud(
+        directions[:, :2] / directions[:, 2:], np.full(80, np.inf), rng.uniform(0.2, 1, 80), np.zeros(80)
+    )
     return cloud, tangents
 
 
 @pytest.mark.parametrize("gaze", [(0.0, 0.0), (0.06, -0.04)])
 def test_a_weight_that_is_linear_in_the_tangent_is_applied_at_each_points_direction(gaze):
-    found = corrections_of(
-        accepted("uniformity", {WEIGHT: linear_map(0.6, 0.8, -0.5)}, extent_deg=EXTENT), fov_rad=FOV
-    )
+    found = corrections_of(accepted("uniformity", {WEIGHT: linear_map(0.6, 0.8, -0.5)}, extent_deg=EXTENT), fov_rad=FOV)
     cloud, tangents = points(gaze)
     wanted = cloud.amplitude**2 * (0.6 + 0.8 * tangents[:, 0] - 0.5 * tangents[:, 1])
     np.testing.assert_allclose(found.apply(cloud, gaze).amplitude ** 2, wanted, rtol=1e-5)

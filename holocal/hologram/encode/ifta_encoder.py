@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import cast
 
+import torch
+
 from holocal.hologram.encode.encoder import Target
 from holocal.hologram.encode.fourier import WindowedTransform
 from holocal.hologram.encode.ifta import Encoded, ifta
@@ -25,4 +27,9 @@ class Ifta:
     def __call__(self, target: Target) -> Encoded:
         """Return the field whose spectrum in the window is nearest to the wanted one."""
         transform = cast(WindowedTransform, target.transform)
-        return ifta(target.start.clone(), target.wanted, target.window, transform, iterations=self.iterations)
+        start = target.start.clone()  # ifta overwrites it
+        found = ifta(start, target.wanted, target.window, transform, iterations=self.iterations)
+        if int(torch.count_nonzero(found.field)) < found.field.numel():
+            # Where the hologram is 0 and nothing was added, ifta ends at 0, which no panel shows.
+            found.field[found.field == 0] = 1
+        return found
