@@ -249,3 +249,25 @@ def test_the_field_that_is_given_is_left_as_it_was():
     before = start.clone()
     propagate(start, pitch_m=PITCH, wavelength_m=WAVELENGTH, distance_m=20e-3)
     assert torch.equal(start, before)
+
+
+def test_light_near_the_sampling_limit_is_doubted_only_where_its_other_order_meets_the_window():
+    n = 160
+    x = (np.arange(n) - (n - 1) / 2)[None, :]
+    beam = np.exp(-(x**2 + x.T**2) / 30**2 + 2j * np.pi * 0.47 * x)  # order -1 is at 0.53 cycles per pixel
+    keys = {"pitch_m": PITCH, "wavelength_m": WAVELENGTH}
+    limit = critical_distance((n, n), **keys)
+    propagate(torch.from_numpy(beam), distance_m=0.99 * limit, **keys)  # it goes 0.53 0.99 / 0.5 n pixels sideways
+    with pytest.warns(SamplingWarning, match="along x"):
+        propagate(torch.from_numpy(beam), distance_m=0.8 * limit, **keys)
+
+
+def test_the_band_limit_of_a_wide_window_lets_light_go_further_along_rows_than_along_columns():
+    y, x = ((31.5 - np.arange(64))[:, None], (np.arange(200) - 99.5)[None, :])
+    # 0.3 cycles per pixel move 133 px in 12 mm: more than half the padded rows, 64, less than half the columns, 200.
+    envelope = np.exp(-((x + 60) ** 2 + y**2) / 9**2)
+    sideways, upwards = (envelope * np.exp(0.6j * np.pi * u) for u in (x + 0 * y, y + 0 * x))
+    keys = {"pitch_m": PITCH, "wavelength_m": WAVELENGTH, "distance_m": 12e-3}
+    kept, lost = (angular_spectrum(torch.from_numpy(beam), **keys).abs().square().sum() for beam in (sideways, upwards))
+    assert float(kept) > 0.8 * float(np.sum(envelope**2))  # all but what spreads over the top and the bottom
+    assert float(lost) < 1e-4 * float(np.sum(envelope**2))
