@@ -264,7 +264,7 @@ def test_light_near_the_sampling_limit_is_doubted_only_where_its_other_order_mee
 
 def test_the_band_limit_of_a_wide_window_lets_light_go_further_along_rows_than_along_columns():
     y, x = ((31.5 - np.arange(64))[:, None], (np.arange(200) - 99.5)[None, :])
-    # 0.3 cycles per pixel move 133 px in 12 mm: more than half the padded rows, 64, and less than half the columns, 200.
+    # 0.3 cycles per pixel move 133 px in 12 mm: more than half the padded rows, 64, less than half the columns, 200.
     envelope = np.exp(-((x + 60) ** 2 + y**2) / 9**2)
     sideways, upwards = (envelope * np.exp(0.6j * np.pi * u) for u in (x + 0 * y, y + 0 * x))
     keys = {"pitch_m": PITCH, "wavelength_m": WAVELENGTH, "distance_m": 12e-3}
