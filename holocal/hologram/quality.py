@@ -30,7 +30,9 @@ from holocal.hologram.encode.gradient_descent import GradientDescent
 from holocal.hologram.encode.ifta_encoder import Ifta
 from holocal.optics.bench import Array
 
-_FINE = 4  # far-field samples per image pixel that a camera's pixel averages; 8 change no value by 0.1 dB
+# Far-field samples per image pixel and axis that a camera's pixel averages, as peers' numbers have it. With 8 a camera
+# image of 38.6 dB has 38.5, one of 53.0 dB 48.3: the highest numbers are as exact as the camera is known to be.
+_FINE = 4
 
 
 def psnr_db(seen: ArrayLike, wanted: ArrayLike, *, fitted: bool = True) -> float:
