@@ -24,8 +24,8 @@ def read_scene(path: Path, *, srgb: bool = False, allow_black: bool = False) -> 
     """Return the intensity of a scene image, (height, width) float32, >= 0, row 0 on top.
 
     Integer images are scaled to 0..1; colour becomes luminance; `srgb` undoes the sRGB transfer curve first (the
-    default takes values as intensities). An alpha channel must be opaque everywhere. `allow_black` is for images that are
-    part of a scene: a layer may be empty, a scene may not.
+    default takes values as intensities). An alpha channel must be opaque everywhere. `allow_black` is for
+    images that are part of a scene: a layer may be empty, a scene may not.
 
     Raises
     ------

@@ -19,7 +19,8 @@ Image = NDArray[np.float32]
 class ScatteredPoints:
     """Luminous points: `angle_rad` (n, 2) from the gaze along x and y, `distance_m` (n,), `intensity` (n,).
 
-    The direction's tangents are (tan(angle x), tan(angle y)); a distance is from the pupil's centre and may be infinite.
+    The direction's tangents are (tan(angle x), tan(angle y)); a distance is from the pupil's centre, and infinity is
+    one.
     """
 
     angle_rad: Array

@@ -45,7 +45,7 @@ class LayerTable(Table):
 
 
 class RgbdTable(Table):
-    """``[rgbd]``: an image, and depths: metres in an EXR file, else linear in dioptres, 0 at `far_m`, full at `near_m`."""
+    """``[rgbd]``: an image and its depths: metres in an EXR file, else linear in dioptres, 0 `far_m`, full `near_m`."""
 
     image: str
     depth: str

@@ -1,13 +1,14 @@
 """A mesh in an OBJ or PLY file -> triangles with an intensity at each corner.
 
-trimesh parses. What it takes silently and should not (measured with 4.12: indices that are 0 or relative in OBJ, indices
-that are missing in PLY, files cut short) is found here.
+trimesh parses. What it takes silently and should not (measured with 4.12: indices that are 0 or relative in OBJ,
+indices that are missing in PLY, files cut short) is found here.
 """
 
 from __future__ import annotations
 
 import re
 from io import BytesIO
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from holocal.records.files import one_line
 from holocal.records.scene import LUMINANCE, linear
 from holocal.records.scene_data import Array, Mesh
 
-LARGEST_FILE_BYTES = 2**30
+LARGEST_FILE_BYTES = 2**28
 MOST_FACES = 20_000_000
 _PARSING = (ValueError, IndexError, KeyError, TypeError, AttributeError, OverflowError, NotImplementedError)
 
@@ -110,7 +111,7 @@ def _checked_obj(path: Path, data: bytes) -> bytes:
 def _check_obj_vertex(path: Path, number: int, line: str) -> None:
     values = line.partition("#")[0].split()[1:]
     try:
-        finite = len(values) >= 3 and bool(np.isfinite([float(value) for value in values]).all())
+        finite = len(values) >= 3 and all(isfinite(float(value)) for value in values)
     except ValueError:
         finite = False
     if not finite:
@@ -145,7 +146,7 @@ def _check_obj_face(path: Path, number: int, line: str, vertices: int) -> None:
 
 def _check_ply(path: Path, data: bytes) -> None:
     """Raise InputError when an ASCII file has fewer lines than its header says, or any header too many."""
-    head, end, body = data[: 2**16].partition(b"end_header")
+    head, end, _ = data[: 2**16].partition(b"end_header")
     declared = [int(count) for count in re.findall(rb"^element[ \t]+\S+[ \t]+(\d{1,18})\s*$", head, re.MULTILINE)]
     if not end or not data.startswith(b"ply"):
         raise InputError(f"{path} is not a PLY file: its header does not begin with ply or does not end.")
@@ -195,6 +196,6 @@ def _intensity(mesh: Any, faces: np.ndarray[Any, np.dtype[np.int64]], *, srgb: b
     if kind not in ("vertex", "face"):
         return np.ones(faces.shape)
     colours = np.asarray(mesh.visual.vertex_colors if kind == "vertex" else mesh.visual.face_colors)[:, :3]
-    values = colours.astype(np.float32) / 255
+    values = (colours / 255).astype(np.float32)
     luminance = (linear(values) if srgb else values) @ np.asarray(LUMINANCE)
     return luminance[faces] if kind == "vertex" else np.repeat(luminance[:, None], 3, axis=1)

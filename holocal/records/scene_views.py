@@ -78,7 +78,8 @@ def _nearest_mm(path: Path, tables: list[ViewTable]) -> float | None:
     )
     if nearest < 1e-3:  # a micrometre: two wavelengths
         raise InputError(
-            f"{path}: views {one + 1} and {other + 1} are {nearest:g} mm apart, at pupil_mm = {list(tables[one].pupil_mm)}.",
+            f"{path}: views {one + 1} and {other + 1} are {nearest:g} mm apart, "
+            f"at pupil_mm = {list(tables[one].pupil_mm)}.",
             fix="Give each view its own place, or set aperture_mm.",
             measured=nearest,
             limit=1e-3,
