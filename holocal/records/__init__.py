@@ -9,6 +9,12 @@ files           atomic writes, JSON, TOML
 maps            OpenEXR of named channels
 frames          PNG: what the panel is sent, and camera counts
 scene           a scene image -> intensity, checked at the border
+scene_data      what the files of the other scenes hold, as plain data
+scene_points    points in a CSV file
+scene_layers    images with depths, listed in a TOML file
+scene_mesh      a mesh in an OBJ or PLY file
+scene_views     the views of a light field, listed in a TOML file
+scene_toml      what the two lists have in common
 manifest        SHA-256 and size of every file of a run
 calibration     which accepted runs are in force for a rig
 ==============  ==========================================================

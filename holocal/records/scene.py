@@ -20,11 +20,12 @@ LUMINANCE = (0.2126, 0.7152, 0.0722)  # ITU-R BT.709
 FORMATS = ("bmp", "jpeg", "openexr", "png", "pnm", "tiff")
 
 
-def read_scene(path: Path, *, srgb: bool = False) -> NDArray[np.float32]:
+def read_scene(path: Path, *, srgb: bool = False, allow_black: bool = False) -> NDArray[np.float32]:
     """Return the intensity of a scene image, (height, width) float32, >= 0, row 0 on top.
 
     Integer images are scaled to 0..1; colour becomes luminance; `srgb` undoes the sRGB transfer curve first (the
-    default takes values as intensities). An alpha channel must be opaque everywhere.
+    default takes values as intensities). An alpha channel must be opaque everywhere. `allow_black` is for
+    images that are part of a scene: a layer may be empty, a scene may not.
 
     Raises
     ------
@@ -49,6 +50,8 @@ def read_scene(path: Path, *, srgb: bool = False) -> NDArray[np.float32]:
             limit=[1, 3],
         )
     _check_values(path, colour)
+    if not allow_black and not colour.any():
+        raise InputError(f"{path} is black everywhere.", why="There is no light to form.", measured=0.0)
     if srgb:
         colour = linear(colour)
     if len(names) == 1:
@@ -154,8 +157,6 @@ def _check_values(path: Path, values: NDArray[np.float32]) -> None:
             measured=least,
             limit=0.0,
         )
-    if not values.any():
-        raise InputError(f"{path} is black everywhere.", why="There is no light to form.", measured=0.0)
 
 
 def _reason() -> str:

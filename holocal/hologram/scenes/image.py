@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -16,22 +16,45 @@ _MOST_POINTS = 64_000_000  # an 8000 x 8000 image; more than the panel could eve
 
 
 class InitialPhase(Protocol):
-    """The phase each point starts with: a function of the grid of points."""
+    """The phase each point starts with: a function of the grid of points, or of points anywhere."""
 
     def __call__(self, x_tan: Array, y_tan: Array) -> Array:
         """Return phases (len(y_tan), len(x_tan)) in radians."""
         ...
 
+    def at(self, field_tan: Array) -> Array:
+        """Return phases (n,) in radians of points at tangents (n, 2); of a grid's, row by row, the grid's phases."""
+        ...
+
+    def of_layer(self, index: int) -> InitialPhase:
+        """Return the phase of a scene's layer `index`, 0 being this one: unrelated to it where phases are random."""
+        ...
+
 
 @dataclass(frozen=True)
 class RandomPhase:
-    """Uniform in [0, 2 pi), from a seed: spreads the light evenly over the pupil, at the price of speckle."""
+    """Uniform in [0, 2 pi), from a seed: spreads the light evenly over the pupil, at the price of speckle.
+
+    Equal seeds and layers give equal phases: to a grid by pixel, to scattered points in their order.
+    """
 
     seed: int
+    layer: int = 0
 
     def __call__(self, x_tan: Array, y_tan: Array) -> Array:
         """Return phases (len(y_tan), len(x_tan)) in radians."""
-        return np.random.default_rng(self.seed).random((len(y_tan), len(x_tan))) * (2 * np.pi)
+        return self._generator().random((len(y_tan), len(x_tan))) * (2 * np.pi)
+
+    def at(self, field_tan: Array) -> Array:
+        """Return phases (n,) in radians, in the points' order, wherever they are."""
+        return self._generator().random(len(field_tan)) * (2 * np.pi)
+
+    def of_layer(self, index: int) -> RandomPhase:
+        """Return independent phases for each index."""
+        return replace(self, layer=self.layer + index)
+
+    def _generator(self) -> np.random.Generator:
+        return np.random.default_rng((self.seed, self.layer) if self.layer else self.seed)
 
 
 @dataclass(frozen=True)
@@ -41,6 +64,70 @@ class ZeroPhase:
     def __call__(self, x_tan: Array, y_tan: Array) -> Array:
         """Return phases (len(y_tan), len(x_tan)) in radians."""
         return np.zeros((len(y_tan), len(x_tan)))
+
+    def at(self, field_tan: Array) -> Array:
+        """Return phases (n,) in radians."""
+        return np.zeros(len(field_tan))
+
+    def of_layer(self, index: int) -> ZeroPhase:
+        """Return the same phase for each index."""
+        return self
+
+
+@dataclass(frozen=True)
+class QuadraticPhase:
+    """A smooth phase that sends the light of each part of the field through its own part of the pupil.
+
+    A point in the direction s (sines) with the phase psi(s) crosses the pupil as exp(i (psi(s) - k q . s)), so that its
+    eye sees E(s) = sum_q U(q) exp(i k q . s) (docs/physics.md 5). Neighbours add up where that phase is stationary:
+    q = (1 / k) d psi / d s. With
+
+        psi(s) = (pi / wavelength) c |s|^2,        |s|^2 = |t|^2 / (1 + |t|^2),        q = c s,
+
+    the pupil holds a picture of the field, c metres per unit of s, upright. c is such that the field's corners come to
+    `share` of the pupil's radius. No speckle; but a smooth area uses only its own place of the pupil, so that it is
+    seen with great depth of focus, and dust there shows.
+
+    The picture in the pupil repeats every wavelength / (spacing of the points): 0.87 mm for 750 points in 25 degrees
+    at 515 nm. Only points closer than wavelength / (pupil diameter), 0.01 degrees for 3 mm, make it single.
+
+    Parameters
+    ----------
+    wavelength_m
+        Wavelength in metres.
+    fov_rad
+        Full angles (x, y) of the image.
+    pupil_diameter_m
+        The pupil's diameter.
+    share
+        Of the pupil's radius that the field's corners reach.
+    """
+
+    wavelength_m: float
+    fov_rad: tuple[float, float]
+    pupil_diameter_m: float
+    share: float = 0.8
+
+    @property
+    def curvature_m(self) -> float:
+        """Metres in the pupil per unit of direction sine: c."""
+        corner = np.tan(self.fov_rad[0] / 2) ** 2 + np.tan(self.fov_rad[1] / 2) ** 2
+        return float(self.share * self.pupil_diameter_m / 2 / np.sqrt(corner / (1 + corner)))
+
+    def __call__(self, x_tan: Array, y_tan: Array) -> Array:
+        """Return phases (len(y_tan), len(x_tan)) in radians."""
+        return self._of(x_tan[None, :] ** 2 + y_tan[:, None] ** 2)
+
+    def at(self, field_tan: Array) -> Array:
+        """Return phases (n,) in radians."""
+        return self._of(np.sum(field_tan**2, axis=-1))
+
+    def of_layer(self, index: int) -> QuadraticPhase:
+        """Return the same phase for each index."""
+        return self
+
+    def _of(self, tan_squared: Array) -> Array:
+        return np.pi / self.wavelength_m * self.curvature_m * tan_squared / (1 + tan_squared)
 
 
 def checked_intensity(intensity: ArrayLike) -> NDArray[np.float64]:
