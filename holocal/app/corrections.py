@@ -142,7 +142,7 @@ def _wavefront(accepted: Accepted, fov_rad: tuple[float, float]) -> Wavefront:
         raise _missing(accepted, "channels correction.noll_<j>_rad and a wavelength_nm")
     maps = {j: _map(accepted, names[j]) for j in sorted(names)}
     half = (float(np.tan(fov_rad[0] / 2)), float(np.tan(fov_rad[1] / 2)))
-    line = np.linspace(-1, 1, 4 * _FIELD_DEGREE + 1)
+    line = 0.96 * np.linspace(-1, 1, 4 * _FIELD_DEGREE + 1)  # inside the centres of the border pixels of most maps
     nodes = np.stack(np.meshgrid(line * half[0], line * half[1]), axis=-1).reshape(-1, 2)
     inverse = np.linalg.pinv(field_basis(nodes, half, _FIELD_DEGREE))
     rows = tuple(tuple(float(c) for c in inverse @ one.at(nodes)) for one in maps.values())

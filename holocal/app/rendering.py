@@ -4,26 +4,37 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from holocal.app import session
-from holocal.app.corrections import corrected
-from holocal.errors import InputError, UsageError
-from holocal.hologram.pipeline import HologramSettings, render_image
-from holocal.hologram.settings import Warped, Zones
+from holocal.app import scenes, session
+from holocal.app.corrections import Corrections, corrections_of
+from holocal.errors import UsageError
+from holocal.hologram.encode.direct_search import DirectSearch
+from holocal.hologram.encode.double_phase import DoublePhase
+from holocal.hologram.encode.encoder import Encoder
+from holocal.hologram.encode.error_diffusion import ErrorDiffusion
+from holocal.hologram.encode.gradient_descent import GradientDescent
+from holocal.hologram.encode.ifta_encoder import Ifta
+from holocal.hologram.pipeline import HologramSettings, Rendered
+from holocal.hologram.pipeline import render as render_points
+from holocal.hologram.settings import Direct, Method, Warped, Zones
 from holocal.optics.bench import Bench, Panel
+from holocal.records.cache import ArrayCache
+from holocal.records.facts import RigFacts
 from holocal.records.files import storage_error
 from holocal.records.frames import PACKINGS, write_frame
 from holocal.records.maps import write_maps
 from holocal.records.rig import RigConfig, identity
-from holocal.records.scene import read_scene
 from holocal.units import DEGREE, NM
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".exr", ".bmp", ".pgm", ".ppm", ".pnm")
+ENCODERS = ("ifta", "gradient-descent", "direct-search", "error-diffusion", "double-phase")
+METHODS = ("warped", "zones", "direct")
+_GREEN_NM, _BLUE_NM = 580.0, 490.0  # a line above the first shows the image's red, above the second its green
 
 
 @dataclass(frozen=True)
@@ -35,9 +46,15 @@ class Request:
     gaze_deg: tuple[float, float]
     depth_m: float
     wavelength_nm: float
+    colour: bool
     srgb: bool
-    zones: int | None  # None: warped patches
+    method: str
+    accuracy_rad: float
+    zones: int | None  # None: as `method` says
+    encoder: str
     iterations: int
+    initial_phase: str
+    pixels: tuple[int, int]
     seed: int
     corrections: str
 
@@ -51,6 +68,16 @@ class Outputs:
     phase: Path | None
     hologram: Path | None
 
+    def of_line(self, wavelength_nm: float) -> Outputs:
+        """Return the names for one of several wavelengths: ``frame.png`` becomes ``frame-515nm.png``."""
+
+        def named(path: Path | None) -> Path | None:
+            return None if path is None else path.with_name(f"{path.stem}-{wavelength_nm:g}nm{path.suffix}")
+
+        return replace(
+            self, frame=named(self.frame) or self.frame, phase=named(self.phase), hologram=named(self.hologram)
+        )
+
 
 def check(asked: Request, outputs: Outputs) -> None:
     """Raise `UsageError` for options that cannot be, before anything is computed."""
@@ -60,6 +87,7 @@ def check(asked: Request, outputs: Outputs) -> None:
         ("--gaze-deg", max(asked.gaze_deg, key=abs), -60.0, 60.0),
         ("--depth-m", asked.depth_m, 0.01, math.inf),
         ("--wavelength-nm", asked.wavelength_nm, 200.0, 12000.0),
+        ("--accuracy", asked.accuracy_rad, 1e-3, 10.0),
     ]
     for name, value, low, high in limits:
         if not low <= value <= high:  # NaN too
@@ -69,12 +97,20 @@ def check(asked: Request, outputs: Outputs) -> None:
                 measured=value,
                 limit=[low, high],
             )
-    if outputs.packing not in PACKINGS:
-        raise UsageError(f"--packing {outputs.packing} is not known.", fix=f"Choose {' or '.join(PACKINGS)}.")
-    if asked.scene.exists() and asked.scene.suffix.lower() not in IMAGE_SUFFIXES:
-        raise InputError(
-            f"{asked.scene} is not an image.", fix=f"Scenes are images for now: {', '.join(IMAGE_SUFFIXES)}."
+    choices = (
+        ("--packing", outputs.packing, PACKINGS),
+        ("--method", asked.method, METHODS),
+        ("--encoder", asked.encoder, ENCODERS),
+        ("--initial-phase", asked.initial_phase, scenes.PHASES),
+    )
+    for option, choice, known in choices:
+        if choice not in known:
+            raise UsageError(f"{option} {choice} is not known.", fix=f"Choose {', '.join(known)}.")
+    if asked.zones is not None and asked.method == "direct":
+        raise UsageError(
+            "--zones is the thesis's method; it does not go with --method direct.", fix="Drop one of them."
         )
+    scenes.check_kind(asked.scene)
     for path, suffix in ((outputs.frame, ".png"), (outputs.phase, ".exr"), (outputs.hologram, ".exr")):
         if path is not None and path.suffix.lower() != suffix:
             raise UsageError(f"{path} does not end in {suffix}.", fix=f"Give it a name that ends in {suffix}.")
@@ -83,47 +119,134 @@ def check(asked: Request, outputs: Outputs) -> None:
 
 
 def render(config: RigConfig, asked: Request, outputs: Outputs) -> dict[str, Any]:
-    """Return the JSON of a rendered scene, after writing its files."""
+    """Return the JSON of a rendered scene, after writing its files: one frame, or one for each of the rig's lines."""
     began = time.monotonic()
-    scene = read_scene(asked.scene, srgb=asked.srgb)
+    scene = scenes.read(asked.scene, srgb=asked.srgb, colour=asked.colour)
     read_s = time.monotonic() - began
     with session.opened_rig(config) as rig:
         facts = rig.facts()
     in_force = session.corrections(asked.corrections, identity(facts))
     fov_rad = (asked.fov_deg[0] * DEGREE, asked.fov_deg[1] * DEGREE)
-    gaze_rad = (asked.gaze_deg[0] * DEGREE, asked.gaze_deg[1] * DEGREE)
-    settings = HologramSettings(
-        panel=Panel(facts.slm.width, facts.slm.height, facts.slm.pitch_m),
-        bench=Bench.nominal(pupil_diameter_m=facts.pupil_diameter_m, eye_relief_m=facts.eye_relief_m),
-        wavelength_m=asked.wavelength_nm * NM,
-        fov_rad=fov_rad,
-        gaze_rad=gaze_rad,
-        depth_m=asked.depth_m,
-        method=Warped() if asked.zones is None else Zones(asked.zones),
-        iterations=asked.iterations,
-        device=config.device,
-    )
-    intensity = corrected(scene, in_force, fov_rad=fov_rad, gaze_rad=gaze_rad)
-    rendered = render_image(intensity, settings, seed=asked.seed, keep_complex=outputs.hologram is not None)
-    began_writing = time.monotonic()
-    _write(rendered, outputs, metadata={"wavelength_nm": asked.wavelength_nm, "pitch_um": facts.slm.pitch_m * 1e6})
-    written_s = time.monotonic() - began_writing
-    return {
+    corrections = corrections_of(in_force, fov_rad=fov_rad)
+    common = {
         "schema": 1,
-        "frame": str(outputs.frame),
         "rig": config.name,
+        "scene": scene.kind,
         "width": facts.slm.width,
         "height": facts.slm.height,
-        "seconds": {"read": read_s, **rendered.seconds, "write": written_s},
-        "total_seconds": time.monotonic() - began,
-        "skipped": list(rendered.skipped),
-        "efficiency": rendered.efficiency,
         "corrections": {name: found.entry for name, found in in_force.items()},
         "seed": asked.seed,
     }
+    if not asked.colour:
+        said = _line(scene.content(None), asked, asked.wavelength_nm, outputs, facts, config, corrections)
+        seconds = {"read": read_s, **said.pop("seconds")}
+        return common | said | {"seconds": seconds, "total_seconds": time.monotonic() - began}
+    lines = [
+        _line(scene.content(_colour_of(nm)), asked, nm, outputs.of_line(nm), facts, config, corrections)
+        for nm in sorted((line / NM for line in facts.wavelengths_m), reverse=True)
+    ]
+    return common | {
+        "frames": lines,
+        "skipped": [f"{one['wavelength_nm']:g} nm: {said}" for one in lines for said in one["skipped"]],
+        "seconds": {"read": read_s, **_summed([one["seconds"] for one in lines])},
+        "total_seconds": time.monotonic() - began,
+    }
 
 
-def _write(rendered: Any, outputs: Outputs, *, metadata: dict[str, Any]) -> None:
+def _line(
+    content: scenes.Content,
+    asked: Request,
+    wavelength_nm: float,
+    outputs: Outputs,
+    facts: RigFacts,
+    config: RigConfig,
+    corrections: Corrections,
+) -> dict[str, Any]:
+    """Render one wavelength and write its files; one without light writes none."""
+    settings = _settings(asked, wavelength_nm, facts, config, corrections)
+    began = time.monotonic()
+    phase = scenes.phase_of(asked.initial_phase, settings, asked.seed)
+    points = scenes.clouds(content, settings, initial_phase=phase, pixels=asked.pixels)
+    points = [corrections.apply(cloud, settings.gaze_rad) for cloud in points]
+    scene_s = time.monotonic() - began
+    skipped = [f"the accepted {name}: it changes nothing" for name in corrections.identities]
+    if asked.colour and not any(cloud.amplitude.any() for cloud in points):
+        skipped.append("the wavelength: no light in it, no frame")
+        return {"wavelength_nm": wavelength_nm, "frame": None, "seconds": {"scene": scene_s}, "skipped": skipped}
+    rendered = render_points(
+        points,
+        settings,
+        encoder=encoder_of(asked),
+        keep_complex=outputs.hologram is not None,
+        response_rad=corrections.response_rad,
+        store=ArrayCache(),
+    )
+    began_writing = time.monotonic()
+    metadata = {"wavelength_nm": wavelength_nm, "pitch_um": facts.slm.pitch_m * 1e6}
+    _write(rendered, outputs, metadata=metadata)
+    written_s = time.monotonic() - began_writing
+    return {
+        "wavelength_nm": wavelength_nm,
+        "frame": str(outputs.frame),
+        "points": sum(len(cloud) for cloud in points),
+        "seconds": {"scene": scene_s, **rendered.seconds, "write": written_s},
+        "skipped": [*skipped, *rendered.skipped],
+        "efficiency": rendered.efficiency,
+        "signal_error": list(rendered.signal_error),
+    }
+
+
+def _settings(
+    asked: Request, wavelength_nm: float, facts: RigFacts, config: RigConfig, corrections: Corrections
+) -> HologramSettings:
+    return HologramSettings(
+        panel=Panel(facts.slm.width, facts.slm.height, facts.slm.pitch_m),
+        bench=Bench.nominal(pupil_diameter_m=facts.pupil_diameter_m, eye_relief_m=facts.eye_relief_m),
+        wavelength_m=wavelength_nm * NM,
+        fov_rad=(asked.fov_deg[0] * DEGREE, asked.fov_deg[1] * DEGREE),
+        gaze_rad=(asked.gaze_deg[0] * DEGREE, asked.gaze_deg[1] * DEGREE),
+        depth_m=asked.depth_m,
+        method=method_of(asked),
+        iterations=asked.iterations,
+        device=config.device,
+        wavefront=corrections.wavefront,
+    )
+
+
+def method_of(asked: Request) -> Method:
+    """Return the synthesis that the options name."""
+    if asked.zones is not None or asked.method == "zones":
+        return Zones(asked.zones or Zones().count)
+    return Direct() if asked.method == "direct" else Warped(asked.accuracy_rad)
+
+
+def encoder_of(asked: Request) -> Encoder:
+    """Return the encoder that the options name, with as many iterations or passes."""
+    count = asked.iterations
+    makers: Mapping[str, Encoder] = {
+        "ifta": Ifta(count),
+        "gradient-descent": GradientDescent(count),
+        "direct-search": DirectSearch(count),
+        "error-diffusion": ErrorDiffusion(),
+        "double-phase": DoublePhase(),
+    }
+    return makers[asked.encoder]
+
+
+def _colour_of(wavelength_nm: float) -> int:
+    """Return which channel of a colour image a line shows: 0 red, 1 green, 2 blue."""
+    return 0 if wavelength_nm >= _GREEN_NM else 1 if wavelength_nm >= _BLUE_NM else 2
+
+
+def _summed(parts: list[dict[str, float]]) -> dict[str, float]:
+    total: dict[str, float] = {}
+    for part in parts:
+        for stage, spent in part.items():
+            total[stage] = total.get(stage, 0.0) + spent
+    return total
+
+
+def _write(rendered: Rendered, outputs: Outputs, *, metadata: dict[str, Any]) -> None:
     write_frame(outputs.frame, rendered.levels, outputs.packing)
     if outputs.phase is not None:
         write_maps(outputs.phase, {"phase": rendered.phase_rad}, units={"phase": "rad"}, metadata=metadata)

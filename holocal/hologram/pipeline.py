@@ -104,7 +104,7 @@ def render(
     levels = phase_to_levels(phase, response_rad)
     clock.lap("levels")
     if encoded.stopped:
-        skipped.append(encoded.stopped)
+        skipped.append(f"further iterations of the encoder: {encoded.stopped}")
     return Rendered(
         levels,
         phase,

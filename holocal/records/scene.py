@@ -32,6 +32,24 @@ def read_scene(path: Path, *, srgb: bool = False, allow_black: bool = False) -> 
     InputError
         The file is absent, empty, damaged, enormous, of another mode, or has values that are no intensities.
     """
+    colour = _channels(path, srgb=srgb, allow_black=allow_black)
+    if colour.shape[-1] == 1:
+        return np.ascontiguousarray(colour[..., 0])
+    red, green, blue = (colour[..., i] for i in range(3))
+    return np.asarray(LUMINANCE[0] * red + LUMINANCE[1] * green + LUMINANCE[2] * blue, np.float32)
+
+
+def read_colour(path: Path, *, srgb: bool = False) -> NDArray[np.float32]:
+    """Return red, green and blue of a scene image, (height, width, 3) float32; of a grey one, three times the same.
+
+    Checked as by `read_scene`; black is allowed, as a colour without light is.
+    """
+    colour = _channels(path, srgb=srgb, allow_black=True)
+    return np.ascontiguousarray(np.broadcast_to(colour, (*colour.shape[:2], 3)))
+
+
+def _channels(path: Path, *, srgb: bool, allow_black: bool) -> NDArray[np.float32]:
+    """Return a checked image's grey (h, w, 1) or its red, green and blue (h, w, 3)."""
     spec = check_size(path)
     pixels, names = _pixels(path)
     integer = spec.format.basetype not in (oiio.FLOAT, oiio.HALF, oiio.DOUBLE)
@@ -54,12 +72,8 @@ def read_scene(path: Path, *, srgb: bool = False, allow_black: bool = False) -> 
         raise InputError(f"{path} is black everywhere.", why="There is no light to form.", measured=0.0)
     if srgb:
         colour = linear(colour)
-    if len(names) == 1:
-        return np.ascontiguousarray(colour[..., 0])
-    red, green, blue = (
-        colour[..., names.index(name)] if name in names else colour[..., i] for i, name in enumerate("RGB")
-    )
-    return np.asarray(LUMINANCE[0] * red + LUMINANCE[1] * green + LUMINANCE[2] * blue, np.float32)
+    order = [names.index(name) if name in names else i for i, name in enumerate("RGB")] if len(names) == 3 else [0]
+    return np.ascontiguousarray(colour[..., order])
 
 
 def linear(values: NDArray[np.float32]) -> NDArray[np.float32]:

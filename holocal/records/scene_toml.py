@@ -19,7 +19,7 @@ LARGEST_FILE_BYTES = 4 * 2**20  # a thousand views are 100 KB
 
 
 def read_tables(path: Path) -> dict[str, Any]:
-    """Return a TOML file's tables without its schema, or raise InputError: absent, not TOML, of another schema."""
+    """Return a TOML file's tables without its schema, or raise InputError: absent, not TOML, another schema."""
     try:
         size = path.stat().st_size
         if size > LARGEST_FILE_BYTES:
@@ -36,11 +36,11 @@ def read_tables(path: Path) -> dict[str, Any]:
         raise InputError(f"{path} is not a text file: {error.reason} at byte {error.start}.") from error
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{path} is not a TOML file: {error}.", fix="Correct that line.") from error
-    schema = tables.pop("schema", None)
+    schema = tables.pop("schema", SCHEMA)
     if type(schema) is not int or schema != SCHEMA:
         raise InputError(
-            f"{path}: schema is {'missing' if schema is None else repr(schema)}; this holocal reads schema {SCHEMA}.",
-            fix=f"Begin the file with schema = {SCHEMA}.",
+            f"{path}: schema is {schema!r}; this holocal reads schema {SCHEMA}.",
+            fix=f"Write schema = {SCHEMA}, or leave it out.",
             measured=schema,
             limit=SCHEMA,
         )

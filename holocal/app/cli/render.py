@@ -12,7 +12,10 @@ from holocal.app.cli import options
 
 
 def render(
-    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="An image: PNG, JPEG, TIFF or OpenEXR.")],
+    scene: Annotated[
+        Path,
+        typer.Argument(metavar="SCENE", help="Image, points .csv, mesh .obj .ply, layers or views .toml."),
+    ],
     out: Annotated[Path, typer.Option("--out", help="The frame to write, PNG.")] = Path("frame.png"),
     packing: Annotated[str, typer.Option("--packing", metavar="rgb|mono8", help="How the panel wants it.")] = "rgb",
     phase_out: Annotated[Path | None, typer.Option("--phase-out", help="Phase before quantisation, EXR.")] = None,
@@ -24,12 +27,37 @@ def render(
     gaze_deg: Annotated[tuple[float, float], typer.Option("--gaze-deg", help="Centre of the scene, x and y.")] = (0, 0),
     depth_m: Annotated[float, typer.Option("--depth-m", help="Distance of the scene.")] = math.inf,
     wavelength_nm: options.Wavelength = 515.0,
+    colour: Annotated[
+        bool, typer.Option("--colour", help="A frame per wavelength of the rig: --out frame.png gives frame-515nm.png.")
+    ] = False,
     srgb: Annotated[bool, typer.Option("--srgb", help="Undo the sRGB curve of the image first.")] = False,
     zones: Annotated[
         int | None,
         typer.Option("--zones", min=1, max=64, help="The thesis's method with so many zones along each side."),
     ] = None,
-    iterations: Annotated[int, typer.Option("--iterations", min=0, max=1000, help="IFTA iterations.")] = 10,
+    method: Annotated[
+        str, typer.Option("--method", metavar="warped|zones|direct", help="How the points are summed.")
+    ] = "warped",
+    accuracy: Annotated[
+        float, typer.Option("--accuracy", metavar="RAD", help="Wavefront error that the warped method may leave.")
+    ] = 0.1,
+    encoder: Annotated[
+        str,
+        typer.Option(
+            "--encoder",
+            metavar="ifta|gradient-descent|direct-search|error-diffusion|double-phase",
+            help="To phase only.",
+        ),
+    ] = "ifta",
+    iterations: Annotated[
+        int, typer.Option("--iterations", min=0, max=1000, help="Iterations of the encoder; it stops when none pays.")
+    ] = 10,
+    initial_phase: Annotated[
+        str, typer.Option("--initial-phase", metavar="random|smooth|zero", help="Of the points.")
+    ] = "random",
+    pixels: Annotated[
+        tuple[int, int], typer.Option("--pixels", min=1, max=8000, help="Columns and rows that sample a mesh.")
+    ] = (750, 750),
     rig: options.Rig = options.DEFAULT_RIG,
     corrections: options.Corrections = "accepted",
     seed: options.Seed = 0,
@@ -49,9 +77,15 @@ def render(
         gaze_deg=gaze_deg,
         depth_m=depth_m,
         wavelength_nm=wavelength_nm,
+        colour=colour,
         srgb=srgb,
+        method=method,
+        accuracy_rad=accuracy,
         zones=zones,
+        encoder=encoder,
         iterations=iterations,
+        initial_phase=initial_phase,
+        pixels=pixels,
         seed=seed,
         corrections=corrections,
     )
@@ -69,4 +103,6 @@ def render(
     if json:
         emit_json(said)
     else:
-        emit(str(out))
+        for frame in said["frames"] if colour else [said]:
+            if frame["frame"]:
+                emit(frame["frame"])

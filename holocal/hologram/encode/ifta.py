@@ -32,6 +32,7 @@ from holocal.hologram.encode.fourier import WindowedTransform
 from holocal.optics.bench import Array
 
 _TINY = 1e-30
+_PATIENCE = 4  # few bright points: 0.40, 0.38, 0.55, 0.44, 0.25 and down to 0.08; the way there may lead uphill
 _RELAXATION, _MOMENTUM = 1.8, 0.2  # 2 and 0 oscillate; a momentum of 0.3 costs 1.4 % of the light at an error of 0.05
 _CROWDED = 0.5  # of the band; a wider window leaves too little freedom to go too far: at 0.7, 1.8 is worse than 1
 _UNRELATED = 1.0  # a start that leaves more error than signal costs light for good: 0.1 instead of 0.49
@@ -44,7 +45,7 @@ class Encoded:
     `field` (rows, columns) complex64; `efficiency` is the share of its light that is wanted signal: in the window and
     in proportion to the wanted field; `in_window` the share in the window; `signal_error` after each iteration,
     starting with the start's own phase: rms error over rms of the scaled wanted field, inside the window (empty where
-    nothing is wanted); `iterations` done, and why they `stopped`, a sentence.
+    nothing is wanted); `iterations` done, and why they `stopped` early, a sentence, or nothing.
     """
 
     field: torch.Tensor
@@ -127,7 +128,7 @@ def ifta(
         last.power / start.numel(),
         tuple(fit.error for fit in fits),
         done,
-        note + (stopped or f"all {iterations} iterations are done"),
+        note + stopped,
     )
 
 
@@ -198,7 +199,11 @@ def _not_worth_it(fits: list[_Fit], gain: float) -> str:
     if after <= before:
         share = 1 - after / before if before else 0.0
         return f"iteration {len(fits) - 1} took off {share:.2%} of the error, less than {gain:.2%}"
-    return f"iteration {len(fits) - 1} raised the error from {before:.3g} to {after:.3g}"
+    errors = [fit.error for fit in fits]
+    best = int(np.argmin(errors))
+    if len(errors) - 1 - best < _PATIENCE:
+        return ""
+    return f"{_PATIENCE} iterations did not come below the error of {errors[best]:.3g} again"
 
 
 def _each_row(field: torch.Tensor, transform: WindowedTransform) -> None:
