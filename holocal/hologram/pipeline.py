@@ -95,8 +95,7 @@ def render(
         skipped.append("the wavefront correction: it changes nothing")
     complex_field = _undivided(found.field, reference, settings) if keep_complex else None
     clock.lap("complex field")
-    window = torch.from_numpy(_window_mask(settings)).to(settings.device)
-    target = Target(found.field, transform.forward(found.field), window, transform)
+    target = target_of(found.field, settings)
     clock.lap("to pupil")
     encoded = (encoder or Ifta(settings.iterations))(target)
     clock.lap("encode")
@@ -115,6 +114,13 @@ def render(
         encoded.signal_error,
         encoded.field if keep_encoded else None,
     )
+
+
+def target_of(hologram: torch.Tensor, settings: HologramSettings) -> Target:
+    """Return what an encoder is to reach: a hologram (H, W) divided by the reference, its spectrum in the pupil."""
+    transform = _transform(settings)
+    window = torch.from_numpy(_window_mask(settings)).to(settings.device)
+    return Target(hologram, transform.forward(hologram), window, transform)
 
 
 def render_image(

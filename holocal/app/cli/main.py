@@ -16,6 +16,7 @@ import typer
 from holocal import __version__
 from holocal.app.cli import (
     accept,
+    bench,
     capture,
     doctor,
     procedures,
@@ -70,6 +71,7 @@ COMMANDS: tuple[Callable[..., None], ...] = (
     verify.verify,
     render.render,
     capture.capture,
+    bench.bench,
     rigs.rigs,
     procedures.procedures,
     doctor.doctor,
