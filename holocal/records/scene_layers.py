@@ -138,6 +138,7 @@ def _metres(file: Path) -> Array:
     if name not in channels:
         raise InputError(
             f"{file} has the channels {', '.join(channels)}; depths are in its only channel, or in Z.",
+            fix="Name the channel of depths Z.",
             measured=list(channels),
         )
     depth = channels[name].astype(np.float64)

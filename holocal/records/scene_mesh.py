@@ -93,7 +93,7 @@ def _parsed(path: Path, data: bytes, kind: str) -> Any:
 def _checked_obj(path: Path, data: bytes) -> bytes:
     """Return an OBJ file's text as UTF-8, or raise InputError naming the first line that cannot be."""
     if b"\0" in data:
-        raise InputError(f"{path} is not a text file: it has null bytes.")
+        raise InputError(f"{path} is not a text file: it has null bytes.", fix="Export the mesh again.")
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -149,10 +149,16 @@ def _check_ply(path: Path, data: bytes) -> None:
     head, end, _ = data[: 2**16].partition(b"end_header")
     declared = [int(count) for count in re.findall(rb"^element[ \t]+\S+[ \t]+(\d{1,18})\s*$", head, re.MULTILINE)]
     if not end or not data.startswith(b"ply"):
-        raise InputError(f"{path} is not a PLY file: its header does not begin with ply or does not end.")
+        raise InputError(
+            f"{path} is not a PLY file: its header does not begin with ply or does not end.",
+            fix="Export the mesh again.",
+        )
     if sum(declared) > MOST_FACES * 2:
         raise InputError(
-            f"{path} says that it has {sum(declared)} elements.", measured=sum(declared), limit=MOST_FACES * 2
+            f"{path} says that it has {sum(declared)} elements.",
+            fix="Simplify the mesh.",
+            measured=sum(declared),
+            limit=MOST_FACES * 2,
         )
     if re.search(rb"^format[ \t]+ascii", head, re.MULTILINE):
         lines = sum(1 for line in data[len(head) + len(end) :].splitlines() if line.strip())

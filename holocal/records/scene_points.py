@@ -38,7 +38,9 @@ def read_points(path: Path) -> ScatteredPoints:
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}.", fix="Check the path.") from error
     except UnicodeDecodeError as error:
-        raise InputError(f"{path} is not a text file: {error.reason} at byte {error.start}.") from error
+        raise InputError(
+            f"{path} is not a text file: {error.reason} at byte {error.start}.", fix="Save it as UTF-8."
+        ) from error
     theta_x, theta_y, distance, intensity = (table[:, names.index(name)] for name in COLUMNS)
     limits = (
         ("theta_x_deg", theta_x, np.abs(theta_x) < LARGEST_ANGLE_DEG, "between -60 and 60 degrees"),
@@ -75,16 +77,20 @@ def _header(path: Path, file: IO[str]) -> tuple[int, list[str]]:
 
 
 def _table(path: Path, file: IO[str], head: int) -> NDArray[np.float64]:
+    # numpy takes a line of spaces for a value that is missing
+    lines = (line for line in file if line.lstrip()[:1] not in ("", "#"))
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # no rows: said below
-            table = np.loadtxt(file, delimiter=",", comments="#", ndmin=2, max_rows=MOST_POINTS + 1)
+            table = np.loadtxt(lines, delimiter=",", comments="#", ndmin=2, max_rows=MOST_POINTS + 1)
     except UnicodeDecodeError:
         raise
     except ValueError as error:
         raise _fault(path, head, str(error)) from error
     if table.size == 0:
-        raise InputError(f"{path} has no points below its header, line {head}.", measured=0, limit=1)
+        raise InputError(
+            f"{path} has no points below its header, line {head}.", fix="Add a line per point.", measured=0, limit=1
+        )
     if table.shape[1] != len(COLUMNS):
         raise _fault(path, head, f"{table.shape[1]} columns")
     if len(table) > MOST_POINTS:
@@ -125,7 +131,7 @@ def _fault(path: Path, head: int, reason: str) -> InputError:
         for value in values:
             if not _is_number(value):
                 return InputError(f"{path}, line {number}: {value!r} is not a number.", fix="Correct that line.")
-    return InputError(f"{path} is not a table of numbers: {reason}.")
+    return InputError(f"{path} is not a table of numbers: {reason}.", fix="Write four numbers per line.")
 
 
 def _rows(path: Path, head: int) -> Iterator[tuple[int, str]]:

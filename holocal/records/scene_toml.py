@@ -33,7 +33,9 @@ def read_tables(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}.", fix="Check the path.") from error
     except UnicodeDecodeError as error:
-        raise InputError(f"{path} is not a text file: {error.reason} at byte {error.start}.") from error
+        raise InputError(
+            f"{path} is not a text file: {error.reason} at byte {error.start}.", fix="Save it as UTF-8."
+        ) from error
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{path} is not a TOML file: {error}.", fix="Correct that line.") from error
     schema = tables.pop("schema", SCHEMA)
