@@ -30,6 +30,7 @@ from holocal.optics.bench import Array
 _ENGINES_KEPT = 2  # 0.25 GB each on the 4K panel
 _KEPT = 2  # sets of points whose transforms are kept: 0.25 GB each for 750 x 750 points on the 4K panel
 _DENSE = 0.5  # share of lit points from which a scene's dark points are summed too: the transforms stay those of before
+_FEW = 5  # points of one depth are summed one by one: 4 FFT pairs each, where a new depth's plan and transform take 20
 
 
 @dataclass(frozen=True)
@@ -94,36 +95,70 @@ def _by_zones(
 def _by_patches(
     clouds: list[PointCloud], settings: HologramSettings, clock: Clock, skipped: list[str], store: Store | None
 ) -> Hologram | None:
+    many, few = _shared_out(clouds, settings)
+    clock.lap("synthesis")
+    pixels = _many(many, settings, clock, skipped, store) if many else None
+    if few:
+        pixels = direct_hologram(settings, few, pixels)
+        clock.lap("synthesis")
+    return None if pixels is None else Hologram(torch.from_numpy(pixels).to(settings.device), skipped)
+
+
+def _shared_out(
+    clouds: list[PointCloud], settings: HologramSettings
+) -> tuple[list[tuple[Depth, PointCloud]], list[PointCloud]]:
+    """Return the clouds depth by depth, and apart from them the points of depths that hold too few for a plan."""
+    many, few = [], []
+    for cloud in clouds:
+        chosen = cloud if np.count_nonzero(cloud.amplitude) >= _DENSE * len(cloud) else cloud.lit()
+        for depth, index in depth_bins(chosen, settings):
+            part = chosen if len(index) == len(chosen) else chosen.part(index)
+            if len(part) <= _FEW:
+                few.append(part)
+            else:
+                many.append((depth, part))
+    return many, few
+
+
+def _many(
+    parts: list[tuple[Depth, PointCloud]],
+    settings: HologramSettings,
+    clock: Clock,
+    skipped: list[str],
+    store: Store | None,
+) -> Complex | None:
+    """Return the field on the panel of points that share depths, by patches."""
     engine = _engine(settings, store)
     clock.lap("plans")
     spectrum: Complex | None = None
-    for aperture, group in _by_aperture(clouds).items():
+    dark = count = 0
+    for aperture, group in _by_aperture(parts).items():
         on_grid: Complex | None = None
-        for cloud in group:
-            for sums, strengths in engine.sums(cloud, clock):
-                if sums.dark:
-                    skipped.append(
-                        f"{sums.dark} of {len(sums.sums) + sums.dark} patches of the panel: show no lit point"
-                    )
-                if sums.sums:
-                    found = sums.on_grid(strengths)
-                    on_grid = found if on_grid is None else np.add(on_grid, found, out=on_grid)
-                clock.lap("synthesis")
+        for depth, cloud in group:
+            strengths = _strengths(cloud)
+            clock.lap("synthesis")
+            sums = engine.sums(depth, cloud.field_tan)
+            clock.lap("plans")
+            dark, count = dark + sums.dark, count + sums.dark + len(sums.sums)
+            if sums.sums:
+                found = sums.on_grid(strengths)
+                on_grid = found if on_grid is None else np.add(on_grid, found, out=on_grid)
+            clock.lap("synthesis")
         if on_grid is not None:
             masked = engine.panel.spectrum(on_grid, engine.mask(aperture, clock))
             spectrum = masked if spectrum is None else np.add(spectrum, masked, out=spectrum)
             clock.lap("synthesis")
-    if spectrum is None:
-        return None
-    pixels = engine.panel.pixels(spectrum)
+    if dark:
+        skipped.append(f"{dark} of {count} patches of the panel: show no lit point")
+    pixels = None if spectrum is None else engine.panel.pixels(spectrum)
     clock.lap("synthesis")
-    return Hologram(torch.from_numpy(pixels).to(settings.device), skipped)
+    return pixels
 
 
-def _by_aperture(clouds: list[PointCloud]) -> dict[Aperture | None, list[PointCloud]]:
-    groups: dict[Aperture | None, list[PointCloud]] = {}
-    for cloud in clouds:
-        groups.setdefault(cloud.aperture, []).append(cloud)
+def _by_aperture(parts: list[tuple[Depth, PointCloud]]) -> dict[Aperture | None, list[tuple[Depth, PointCloud]]]:
+    groups: dict[Aperture | None, list[tuple[Depth, PointCloud]]] = {}
+    for depth, cloud in parts:
+        groups.setdefault(cloud.aperture, []).append((depth, cloud))
     return groups
 
 
@@ -154,19 +189,8 @@ class WarpedEngine:
             clock.lap("plans")
         return self.masks[aperture]
 
-    def sums(self, cloud: PointCloud, clock: Clock) -> list[tuple[PatchSums, Complex]]:
-        """Return a cloud's transforms, one per depth, with the points' complex amplitudes."""
-        chosen = cloud if np.count_nonzero(cloud.amplitude) >= _DENSE * len(cloud) else cloud.lit()
-        strengths = _strengths(chosen)
-        found = []
-        for depth, index in depth_bins(chosen, self.settings):
-            part = chosen.field_tan[index]
-            clock.lap("synthesis")
-            found.append((self._sums_at(depth, part), strengths[index]))
-            clock.lap("plans")
-        return found
-
-    def _sums_at(self, depth: Depth, field_tan: Array) -> PatchSums:
+    def sums(self, depth: Depth, field_tan: Array) -> PatchSums:
+        """Return the transforms of points at one depth and tangents (n, 2), made if they are not kept."""
         key = (depth, _digest(field_tan))
         sums = self.kept.pop(key, None)
         if sums is None:

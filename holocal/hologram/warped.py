@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from holocal.errors import SamplingError
+from holocal.hologram.encode.blocks import in_blocks
 from holocal.hologram.footprint import EDGE_M, transmission
 from holocal.hologram.phase_model import wanted_phase
 from holocal.hologram.scenes.points import Aperture
@@ -139,14 +140,19 @@ def warped_plan(settings: HologramSettings, depth: Depth, cut: tuple[int, int]) 
     """Return the plan of a given cut (columns, rows) of the panel, for points at one depth."""
     made = layout(settings, cut)
     limit = np.tan(np.asarray(settings.fov_rad) / 2)
-    forms = []
-    for patch in made.patches:
-        seen = visible_field(settings, made.sight.panel(patch.outline), depth)
-        low, high = np.maximum(seen.min(axis=0), -limit), np.minimum(seen.max(axis=0), limit)
-        if np.all(low < high):
-            bounds = ((float(low[0]), float(high[0])), (float(low[1]), float(high[1])))
-            forms.append(PatchForm(patch, seen, fit_warp(settings, made.sight, depth, bounds, patch.box)))
-    return WarpedPlan(made, depth, tuple(forms))
+    forms: list[PatchForm | None] = [None] * len(made.patches)
+
+    def fit(part: slice) -> None:
+        for i in range(part.start, part.stop):
+            patch = made.patches[i]
+            seen = visible_field(settings, made.sight.panel(patch.outline), depth)
+            low, high = np.maximum(seen.min(axis=0), -limit), np.minimum(seen.max(axis=0), limit)
+            if np.all(low < high):
+                bounds = ((float(low[0]), float(high[0])), (float(low[1]), float(high[1])))
+                forms[i] = PatchForm(patch, seen, fit_warp(settings, made.sight, depth, bounds, patch.box))
+
+    in_blocks(fit, len(forms), 1)
+    return WarpedPlan(made, depth, tuple(form for form in forms if form is not None))
 
 
 def accuracy_of(settings: HologramSettings) -> float:

@@ -183,7 +183,6 @@ LAYER = 'schema = 1\n[[layer]]\nimage = "sub/ramp.png"\ndepth_m = 1\n'
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("", "schema is missing; this holocal reads schema 1"),
         ("schema = 2\n", "schema is 2"),
         ("schema = true\n", "schema is True"),
         ("schema = 1\n", "here neither"),

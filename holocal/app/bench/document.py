@@ -23,7 +23,8 @@ NOTES = {
     "synthesis": "750 x 750 points over 25 x 25 degrees, 515 nm, thesis bench, plans warm (`cold`: from nothing). "
     "`wavefront`: phase against the traced path, rms over points and footprints, and the 95th percentile over the "
     "field (zones: after the best tilt and piston, warped: after the best piston only). `L2`: complex field at 2000 "
-    "random pixels of 200 random points against the direct float64 sum, same footprints (zones keep the thesis's wider ones).",
+    "random pixels of 200 random points against the direct float64 sum, same footprints (zones keep the "
+    "thesis's wider ones).",
     "density": "The default method, 0.1 rad. `new points`: positions never seen before, so they are sorted first.",
     "frame": "Plans warm. Stages are seconds, medians.",
     "encoders": "`error`: rms of the window's spectrum against the scaled wanted one. `efficiency`: share of the "

@@ -184,10 +184,9 @@ def camera_psnr(
     half = np.tan(np.asarray(settings.fov_rad) / 2)
     columns = ((x_tan / half[0] + 1) / 2 * wanted.shape[1] - 0.5).astype(np.float32)
     rows = ((1 - y_tan / half[1]) / 2 * wanted.shape[0] - 0.5).astype(np.float32)
-    expected = cv2.remap(wanted.astype(np.float32), *np.meshgrid(columns, rows), cv2.INTER_LINEAR)
-    inside = (
-        (rows[:, None] > 3) & (rows[:, None] < wanted.shape[0] - 4) & (columns > 3) & (columns < wanted.shape[1] - 4)
-    )
+    across, down = np.broadcast_arrays(columns[None, :], rows[:, None])
+    expected = cv2.remap(np.asarray(wanted, np.float32), across.copy(), down.copy(), cv2.INTER_LINEAR)
+    inside = (down > 3) & (down < wanted.shape[0] - 4) & (across > 3) & (across < wanted.shape[1] - 4)
     u, v = np.meshgrid(x_tan / half[0], y_tan / half[1])
     terms = [u**i * v**j for i in range(_VIGNETTING_DEGREE + 1) for j in range(_VIGNETTING_DEGREE + 1 - i)]
     basis = np.stack([term[inside] for term in terms], axis=-1)
