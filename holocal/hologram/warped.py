@@ -128,7 +128,7 @@ def accurate_plan(settings: HologramSettings) -> WarpedPlan:
         error = plan.error_rad
         if error <= limit:
             return plan
-        # far off: one of the finest patches tells in a tenth of a second what all cuts on the way there take a minute for
+        # far off: one of the finest patches tells at once what all cuts on the way there take a minute for
         if cut == found[0] and error > _FAR_OFF * limit:
             error = _middle_error(settings, found[-1])
             if error > _HOPELESS * limit:

@@ -23,6 +23,7 @@ from holocal.optics.zernike import zernike, zernike_gradient
 
 NOLL_THESIS = 10  # thesis 3.1: N = 10 is below the diffraction limit
 _WIDEST_TAN = 1e6  # 0.2 seconds of arc from a right angle
+_MORE_STEPS = 12  # of Newton's search, while a ray through the pupil is not found
 _FARTHEST_M = 1.0  # a search that runs away stops here: far outside any mirror
 FAN_THESIS = 66  # thesis 3.1: 66 by 66 rays fill the pupil
 
@@ -221,6 +222,11 @@ class ExactPhase:
     error_m: Array
 
 
+def _lost(bench: Bench, pupil_m: Array, error_m: Array) -> NDArray[np.bool_]:
+    """Return which rays cross the pupil, or nearly, without landing where they should."""
+    return np.asarray((np.linalg.norm(pupil_m, axis=-1) < bench.pupil_diameter_m) & ~(error_m < 1e-9))
+
+
 def exact_phase(
     bench: Bench,
     points: VirtualPoints,
@@ -245,8 +251,11 @@ def exact_phase(
     eps = np.minimum(1e-6, 1e-4 / np.maximum(inverse, 1e-300))
     jacobian = np.empty((*slm_m.shape[:-1], 2, 2))
     rays = trace_points(bench, points, pupil, gaze_rad)
-    for step in range(steps):
-        if step < 2:  # the map is smooth: a slope from near the solution serves the last steps
+    for step in range(steps + _MORE_STEPS):
+        if step >= steps and not np.any(_lost(bench, pupil, landing_error(rays, slm_m))):
+            break
+        # the map is smooth: a slope from near the solution serves the last steps; far misaligned ones need more
+        if step < 2 or step >= steps:
             for j, axis in enumerate(np.eye(2)):
                 moved = trace_points(bench, points, pupil + axis * eps, gaze_rad).landing_m
                 jacobian[..., j] = (moved - rays.landing_m) / eps

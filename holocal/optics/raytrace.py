@@ -14,6 +14,7 @@ from holocal.optics.bench import Array, Bench
 
 _WIDEST_TAN = 1e6  # a search that runs away stops here: 0.2 seconds of arc from a right angle
 
+
 @dataclass(frozen=True)
 class Rays:
     """Rays from the eye's side to the panel's plane, or back.

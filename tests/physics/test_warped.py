@@ -11,7 +11,7 @@ from holocal.hologram.clock import Clock
 from holocal.hologram.depths import depth_bins
 from holocal.hologram.direct import direct_hologram, direct_sum
 from holocal.hologram.footprint import transmission
-from holocal.hologram.pipeline import HologramSettings, render
+from holocal.hologram.pipeline import HologramSettings
 from holocal.hologram.reference import reference_turns
 from holocal.hologram.scenes.points import Aperture, PointCloud
 from holocal.hologram.settings import Direct, Warped
@@ -223,8 +223,9 @@ def test_points_in_a_convex_outline_are_found():
 
 def test_patches_that_show_no_lit_point_are_left_out_and_named():
     corner = replace(cloud(FULL, 4), field_tan=np.tan(12 * DEG) * np.array([[1.0, 1], [0.99, 1], [1, 0.99], [0.98, 1]]))
-    rendered = render([corner], replace(FULL, panel=Panel(960, 540, 4 * 3.74e-6), iterations=1))
-    assert any("patches of the panel: show no lit point" in sentence for sentence in rendered.skipped)
+    coarse = replace(FULL, panel=Panel(960, 540, 4 * 3.74e-6))
+    found = synthesise([corner], coarse, reach=(9, 9), clock=Clock.start())
+    assert any("patches of the panel: show no lit point" in sentence for sentence in found.skipped)
 
 
 def test_the_same_points_with_another_brightness_use_the_same_plans():

@@ -120,7 +120,7 @@ def test_a_series_with_large_coefficients_is_right_modulo_2_pi(coefficient):
 @given(st.integers(1, LAST), st.floats(0, 1), st.floats(0, 2 * np.pi))
 @settings(deadline=None, max_examples=60, derandomize=True)
 def test_turning_the_point_by_a_period_changes_nothing(noll, radius, angle):
-    n, m = noll_to_nm(noll)
+    _, m = noll_to_nm(noll)
     turned = angle + 2 * np.pi / max(abs(m), 1)
     one, other = (float(zernike([noll], radius * np.cos(a), radius * np.sin(a))[0]) for a in (angle, turned))
     assert np.isfinite(one)
