@@ -27,6 +27,7 @@ from holocal.records.scene_views import read_light_field
 Image = NDArray[np.float32]
 IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".exr", ".bmp", ".pgm", ".ppm", ".pnm")
 KINDS = f"images ({', '.join(IMAGES)}), points (.csv), meshes (.obj, .ply), layers and light fields (.toml)"
+_NEAREST_M, _PLACED_M = 0.01, 1.0  # a mesh nearer than the first is put at the second
 PHASES = ("random", "smooth", "zero")
 
 Content = Image | ScatteredPoints | Mesh | Layers | DepthImage | LightField
@@ -73,9 +74,9 @@ def clouds(
 ) -> list[PointCloud]:
     """Return a scene's clouds of points for a view: field, depth and colour are the settings'.
 
-    A mesh is in metres in the pupil's frame (x towards the panel, y up, z along the gaze); with a finite depth in the
-    settings it is moved there, turned to the eye and scaled to fill 0.8 of the field instead. `pixels` (columns, rows)
-    sample it.
+    A mesh that lies before the eye as it is, all of z above 0.01 m, is in metres in the pupil's frame (x towards the
+    panel, y up, z along the gaze). Any other, and every one with a finite depth in the settings, is moved to that depth
+    (1 m), turned to the eye and scaled to fill 0.8 of the field. `pixels` (columns, rows) sample it.
     """
     fov = settings.fov_rad
     if isinstance(content, ScatteredPoints):
@@ -87,8 +88,9 @@ def clouds(
     if isinstance(content, LightField):
         return light_field_points(content, fov_rad=fov, initial_phase=initial_phase)
     if isinstance(content, Mesh):
-        if np.isfinite(settings.depth_m):
-            content = placed(content, distance_m=settings.depth_m, fov_rad=fov)
+        finite = bool(np.isfinite(settings.depth_m))
+        if finite or not np.all(content.vertices_m[:, 2] > _NEAREST_M):
+            content = placed(content, distance_m=settings.depth_m if finite else _PLACED_M, fov_rad=fov)
         return [mesh_points(content, fov_rad=fov, pixels=pixels, initial_phase=initial_phase)]
     return [image_cloud(content, fov_rad=fov, depth_m=settings.depth_m, initial_phase=initial_phase)]
 

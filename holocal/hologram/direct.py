@@ -13,6 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from holocal.errors import SamplingError
 from holocal.hologram.encode.blocks import in_blocks
 from holocal.hologram.footprint import EDGE_M, transmission
 from holocal.hologram.phase_model import wanted_phase
@@ -24,7 +25,8 @@ from holocal.optics.bench import Array
 from holocal.optics.phase_function import VirtualPoints
 
 _PAIRS = 200_000  # traced at a time
-_DEGREE = 16  # of a point's phase and pupil over the panel: 1e-4 rad on the 4K panel
+_DEGREES = (16, 32, 64)  # of a point's phase and pupil over the panel: 16 leaves 1e-4 rad on the 4K panel
+_TAIL_RAD = 1e-2  # in the last two degrees together; what is left beyond is smaller still
 _BLOCK = 16  # rows at a time, float64 work that stays in the cache
 
 
@@ -56,6 +58,11 @@ def direct_hologram(
 
     Each point's phase and pupil point are traced at the nodes of a Chebyshev series over the panel and interpolated,
     1e-4 rad off: three to five FFT pairs of the panel's size per point.
+
+    Raises
+    ------
+    SamplingError
+        A point is so near that its phase is not smooth over the panel.
     """
     panel = settings.panel
     reference = reference_turns(settings)
@@ -103,4 +110,16 @@ def _wave(settings: HologramSettings, one: PointCloud, reference: Series) -> Ser
         turns = found.phase_rad / (2 * np.pi) - reference.at(slm_m)
         return np.concatenate([turns[:, None], found.pupil_m], axis=1)
 
-    return fit_series(traced, degree=_DEGREE, centre=(0.0, 0.0), half=settings.panel.half_size_m)
+    half = settings.panel.half_size_m
+    for degree in _DEGREES:
+        found = fit_series(traced, degree=degree, centre=(0.0, 0.0), half=half)
+        tail = np.abs(found.coefficients[-2:, :, 0]).sum() + np.abs(found.coefficients[:, -2:, 0]).sum()
+        if tail * 2 * np.pi <= _TAIL_RAD:
+            return found
+    raise SamplingError(
+        f"The phase of a point {one.distance_m[0]:.3g} m away is not smooth over the panel: polynomials of degree "
+        f"{_DEGREES[-1]} leave {tail * 2 * np.pi:.2g} rad.",
+        fix="Move the point farther away from the pupil.",
+        measured=float(tail * 2 * np.pi),
+        limit=_TAIL_RAD,
+    )

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
+from holocal.errors import SamplingError
 from holocal.hologram.clock import Clock
 from holocal.hologram.encode.encoder import Encoder, Target
 from holocal.hologram.encode.fourier import WindowedTransform
@@ -37,7 +38,8 @@ class Rendered:
     """A frame and how it came about.
 
     `levels` (H, W) uint8 for the panel; `phase_rad` (H, W) float32 in [0, 2 pi), before quantisation; `field` (H, W)
-    complex64, the full-complex hologram before the linear phase and the encoding, or None; `seconds` per stage;
+    complex64, the full-complex hologram before the linear phase and the encoding, or None (`skipped` says where the
+    brightest amplitude, beyond 1e-12 to 1e12, was scaled to 1); `seconds` per stage;
     `skipped` a sentence for each thing left out; `efficiency` the share of the panel's light that is wanted signal in
     the pupil; `signal_error` after each iteration of the encoder; `encoded` the field of unit modulus, divided by the
     reference, a warm start for the next frame, or None.
@@ -81,7 +83,8 @@ def render(
         Keeps phase functions between programs.
     """
     clock = Clock.start()
-    transform, reference = _transform(settings), _reference(settings)
+    reference, transform = _reference(settings), _transform(settings)
+    _check_band(settings)
     clock.lap("table")
     reach = (transform.reach_rows, transform.reach_columns)
     found = synthesise(clouds, settings, reach=reach, clock=clock, store=store)
@@ -197,6 +200,21 @@ def _mask_at(where: HologramSettings) -> NDArray[np.bool_]:
     margin = _MARGIN_BINS / (min(panel.width, panel.height) * panel.pitch_m)
     frequencies = _transform(where).frequencies(panel.pitch_m, panel.pitch_m)
     return _window(where).contains(*frequencies, margin_per_m=margin)
+
+
+def _check_band(settings: HologramSettings) -> None:
+    """Refuse a pupil whose light the panel's pixels cannot tell apart: it would come back on the pupil's other side."""
+    band = 0.5 / settings.panel.pitch_m
+    widest = max(_window(_where(settings)).half_size_per_m)
+    if not widest <= band:
+        raise SamplingError(
+            f"The pupil's image is {widest / band:.2f} times as wide as the panel's band, at "
+            f"{settings.wavelength_m * 1e9:.4g} nm and {settings.panel.pitch_m * 1e6:.3g} um.",
+            why="Light for its rim would alias to the other side.",
+            fix="Use a smaller pupil or gaze, a longer wavelength or a finer pitch.",
+            measured=widest,
+            limit=band,
+        )
 
 
 def _transform(settings: HologramSettings) -> WindowedTransform:

@@ -80,7 +80,7 @@ class HologramSettings:
             ("wavelength_m", self.wavelength_m, 1e-8 < self.wavelength_m < 1e-4, "between 1e-8 and 1e-4 m"),
             ("fov_rad", max(self.fov_rad), all(0 < f < 0.75 * pi for f in self.fov_rad), "0 to 135 degrees"),
             ("gaze_rad", max(self.gaze_rad), all(abs(g) < pi / 3 for g in self.gaze_rad), "within 60 degrees"),
-            ("depth_m", self.depth_m, self.depth_m > 0, "above 0 m"),
+            ("depth_m", self.depth_m, self.depth_m >= 1e-6, "at least 1e-6 m"),
             ("zones", zones, 1 <= zones <= 64, "1 to 64"),
             ("accuracy_rad", accuracy, 1e-3 <= accuracy <= 10, "0.001 to 10 rad"),
             ("iterations", self.iterations, 0 <= self.iterations <= 1000, "0 to 1000"),

@@ -27,6 +27,7 @@ _REFERENCE_DEGREE = 12  # 1e-5 rad on the nominal bench up to a gaze of 13 degre
 _PUPIL_DEGREE = 3  # of u(q) and q(u): the rest moves the rim by less than 1e-3 of the radius
 _PUPIL_TERMS = tuple((i, j) for i in range(_PUPIL_DEGREE + 1) for j in range(_PUPIL_DEGREE + 1 - i))
 _MARGIN = 1.06  # the rectangle of s is wider than the panel's by this much
+_LEAST_GRAINS, _LEAST_SINE = 12, 0.1  # and its half at least 12 grains, wavelength / pupil: 26 pixels of 3.74 um
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,9 @@ def sight(settings: HologramSettings) -> Sight:
     )
     border = seen(rim * half)
     low, high = border.min(axis=0), border.max(axis=0)
-    centre, reach = (low + high) / 2, (high - low) / 2 * _MARGIN
+    # at least some samples of the grid wide: it reaches a few dozen beyond, where a polynomial over one pixel explodes
+    least = min(_LEAST_GRAINS * settings.wavelength_m / bench.pupil_diameter_m, _LEAST_SINE)
+    centre, reach = (low + high) / 2, np.maximum((high - low) / 2 * _MARGIN, least)
     to_panel = fit_series(
         lambda s: _panel_of(settings, s),
         degree=_DEGREE,

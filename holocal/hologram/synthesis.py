@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from holocal.errors import InputError, SamplingError
 from holocal.hologram.clock import Clock
 from holocal.hologram.depths import depth_bins
 from holocal.hologram.direct import direct_hologram
@@ -22,6 +23,7 @@ from holocal.hologram.scenes.points import Aperture, PointCloud
 from holocal.hologram.settings import Direct, HologramSettings, Zones
 from holocal.hologram.stored import Store, stored_plan
 from holocal.hologram.warp import Depth
+from holocal.hologram.warped import accuracy_of
 from holocal.hologram.warped_sum import Complex, PatchSums, ToPanel, patch_sums, phasor, to_panel, tolerance_of
 from holocal.hologram.zone_sum import zones_on_panel
 from holocal.hologram.zones import zone_plan
@@ -29,6 +31,10 @@ from holocal.optics.bench import Array
 
 _ENGINES_KEPT = 2  # 0.25 GB each on the 4K panel
 _KEPT = 2  # sets of points whose transforms are kept: 0.25 GB each for 750 x 750 points on the 4K panel
+_NEAREST_M = 1e-6  # a point nearer than a few waves to the pupil is not seen through it
+_WIDEST_TAN = 1e6  # 0.2 seconds of arc from a right angle
+_LARGEST_PHASE = 1e9  # rad: float64 holds it to 1e-7
+_DIMMEST, _BRIGHTEST = 1e-12, 1e12  # amplitudes: sums over 1e8 points and their squares stay normal float32 numbers
 _DENSE = 0.5  # share of lit points from which a scene's dark points are summed too: the transforms stay those of before
 _FEW = 5  # points of one depth are summed one by one: 4 FFT pairs each, where a new depth's plan and transform take 20
 
@@ -55,18 +61,46 @@ def synthesise(
     phase functions between programs.
     """
     lit = [cloud for cloud in clouds if np.any(cloud.amplitude > 0)]
-    skipped = []
+    _check_places(lit)
+    lit, skipped = _in_range(lit)
     if len(lit) < len(clouds):
         skipped.append(f"{len(clouds) - len(lit)} of {len(clouds)} layers or views: dark")
     if not lit:
         return None
     if isinstance(settings.method, Direct):
-        found = torch.from_numpy(direct_hologram(settings, lit)).to(settings.device)
+        pixels = direct_hologram(settings, lit)
         clock.lap("synthesis")
-        return Hologram(found, skipped)
+        return Hologram(torch.from_numpy(pixels).to(settings.device), skipped) if pixels.any() else None
     if isinstance(settings.method, Zones):
         return _by_zones(lit, settings, reach, clock, skipped)
     return _by_patches(lit, settings, clock, skipped, store)
+
+
+def _check_places(clouds: list[PointCloud]) -> None:
+    """Refuse points whose light float64 cannot follow: the engine's phases would be noise, and say nothing of it."""
+    for cloud in clouds:
+        for what, unit, value, least, most in (
+            ("tangent", "", float(np.abs(cloud.field_tan).max()), 0.0, _WIDEST_TAN),
+            ("initial phase", " rad", float(np.abs(cloud.phase_rad).max()), 0.0, _LARGEST_PHASE),
+            ("distance", " m", float(cloud.distance_m.min()), _NEAREST_M, np.inf),
+        ):
+            if not least <= value <= most:
+                limit = most if value > most else least
+                raise InputError(
+                    f"A point's {what} is {value:.3g}{unit}; the limit is {limit:.3g}{unit}.",
+                    fix="Remove it from the scene.",
+                    measured=value,
+                    limit=limit,
+                )
+
+
+def _in_range(clouds: list[PointCloud]) -> tuple[list[PointCloud], list[str]]:
+    """Return clouds whose amplitudes float32 can hold, sum and square, and a sentence where they were scaled for it."""
+    peak = max((float(cloud.amplitude.max()) for cloud in clouds), default=1.0)
+    if _DIMMEST <= peak <= _BRIGHTEST:
+        return clouds, []
+    scaled = [replace(cloud, amplitude=np.asarray(cloud.amplitude, np.float64) / peak) for cloud in clouds]
+    return scaled, [f"the scene's scale: its brightest amplitude, {peak:.3g}, became 1, for float32 to hold it"]
 
 
 def _by_zones(
@@ -101,6 +135,8 @@ def _by_patches(
     if few:
         pixels = direct_hologram(settings, few, pixels)
         clock.lap("synthesis")
+        if not many and not pixels.any():
+            return None
     return None if pixels is None else Hologram(torch.from_numpy(pixels).to(settings.device), skipped)
 
 
@@ -177,6 +213,7 @@ class WarpedEngine:
     cut: tuple[int, int]
     panel: ToPanel
     store: Store | None
+    error_rad: float  # of points at infinity
     masks: dict[Aperture | None, Complex] = field(default_factory=dict)
     kept: OrderedDict[tuple[Depth, bytes], PatchSums] = field(default_factory=OrderedDict)
 
@@ -195,6 +232,16 @@ class WarpedEngine:
         sums = self.kept.pop(key, None)
         if sums is None:
             plan = stored_plan(self.settings, depth, self.cut, self.store)
+            accuracy = accuracy_of(self.settings)
+            if plan.error_rad > max(accuracy, self.error_rad):
+                raise SamplingError(
+                    f"Points {1 / depth.inverse_m:.3g} m from the pupil are shown with a wavefront error of "
+                    f"{plan.error_rad:.2g} rad (rms), not {accuracy:.2g}.",
+                    why="The patches of the panel are chosen for points far away.",
+                    fix="Move them farther away, ask for a larger --accuracy, or use --method direct.",
+                    measured=plan.error_rad,
+                    limit=accuracy,
+                )
             sums = patch_sums(plan, field_tan, tolerance=tolerance_of(self.settings))
         self.kept[key] = sums
         while len(self.kept) > _KEPT:
@@ -224,9 +271,9 @@ class Engines:
         if found is None:
             while len(self.kept) >= _ENGINES_KEPT:  # first, so that three are never there at once
                 self.kept.popitem(last=False)
-            made = stored_plan(settings, Depth(0.0), None, store).layout
-            panel = to_panel(made, settings.panel, tolerance=tolerance_of(settings))
-            found = WarpedEngine(settings, made.cut, panel, store)
+            far = stored_plan(settings, Depth(0.0), None, store)
+            panel = to_panel(far.layout, settings.panel, tolerance=tolerance_of(settings))
+            found = WarpedEngine(settings, far.layout.cut, panel, store, far.error_rad)
         self.kept[key] = found
         return found
 

@@ -26,11 +26,13 @@ from holocal.optics.bench import Array
 from holocal.optics.phase_function import VirtualPoints, pupil_rim
 from holocal.optics.raytrace import connect
 
+_MOST_SAMPLES = 2**26  # 0.5 GiB of complex64; the 4K panel takes 6 million, 21 with a pupil of 8 mm
 _SPARE = 24  # samples beyond the panel on every side: the mask's edge spreads light over a few
 _FINE_RAD = 0.08  # below this, patches' borders and the mask's edge count too
 _FIT_SHARE, _FINE_SHARE = 0.8, 0.55  # of the wanted error is the fit's; transforms, mask and borders have the rest
 # Widest patch (x, y), metres: 3 x 2 on the 4K panel. Wider ones need a finer grid, and are slower at any accuracy.
 _WIDEST_M = (5.0e-3, 4.1e-3)
+_FAR_OFF, _HOPELESS = 5.0, 2.0  # times the limit: the finest cut leaves an eighth of the coarsest's error at 4K
 _FINER = (1.0, 1.34, 1.67, 2.0, 2.67, 3.34, 4.0, 5.34, 6.67, 9.0)
 
 
@@ -121,38 +123,58 @@ def accurate_plan(settings: HologramSettings) -> WarpedPlan:
     """Return the coarsest plan, for points at infinity, whose phase error is within the setting's accuracy."""
     accuracy = accuracy_of(settings)
     limit = accuracy * (_FIT_SHARE if accuracy >= _FINE_RAD else _FINE_SHARE)
-    error = np.inf
-    for cut in cuts(settings):
+    error, found = np.inf, cuts(settings)
+    for cut in found:
         plan = warped_plan(settings, Depth(0.0), cut)
         error = plan.error_rad
         if error <= limit:
             return plan
+        # far off: one of the finest patches tells at once what all cuts on the way there take a minute for
+        if cut == found[0] and error > _FAR_OFF * limit:
+            error = _middle_error(settings, found[-1])
+            if error > _HOPELESS * limit:
+                break
     raise SamplingError(
         f"The phase functions are {error:.2g} rad (rms) from a bilinear form in the finest patches, not {limit:.2g}.",
+        why="" if settings.wavefront is None else "The wavefront correction may be too strong for this method.",
         fix="Ask for a larger --accuracy, or use --method direct.",
         measured=error,
         limit=limit,
     )
 
 
+def _middle_error(settings: HologramSettings, cut: tuple[int, int]) -> float:
+    """Return the rms phase error of the patch in the panel's middle, in a cut of the panel."""
+    seen_as = _sight(settings)
+    half = np.asarray(seen_as.to_panel.half) / cut
+    box = Box(np.asarray(seen_as.to_panel.centre) + half * (1 - np.asarray(cut) % 2), half)
+    form = _form(settings, seen_as, Depth(0.0), Patch(slice(0, 0), slice(0, 0), box))
+    return 0.0 if form is None else float(np.sqrt(form.warp.square_rad2 / max(form.warp.weight, 1e-300)))
+
+
 @lru_cache(maxsize=32)
 def warped_plan(settings: HologramSettings, depth: Depth, cut: tuple[int, int]) -> WarpedPlan:
     """Return the plan of a given cut (columns, rows) of the panel, for points at one depth."""
     made = layout(settings, cut)
-    limit = np.tan(np.asarray(settings.fov_rad) / 2)
     forms: list[PatchForm | None] = [None] * len(made.patches)
 
     def fit(part: slice) -> None:
         for i in range(part.start, part.stop):
-            patch = made.patches[i]
-            seen = visible_field(settings, made.sight.panel(patch.outline), depth)
-            low, high = np.maximum(seen.min(axis=0), -limit), np.minimum(seen.max(axis=0), limit)
-            if np.all(low < high):
-                bounds = ((float(low[0]), float(high[0])), (float(low[1]), float(high[1])))
-                forms[i] = PatchForm(patch, seen, fit_warp(settings, made.sight, depth, bounds, patch.box))
+            forms[i] = _form(settings, made.sight, depth, made.patches[i])
 
     in_blocks(fit, len(forms), 1)
     return WarpedPlan(made, depth, tuple(form for form in forms if form is not None))
+
+
+def _form(settings: HologramSettings, seen_as: Sight, depth: Depth, patch: Patch) -> PatchForm | None:
+    """Return a patch's bilinear form, or None where it shows nothing of the field."""
+    limit = np.tan(np.asarray(settings.fov_rad) / 2)
+    seen = visible_field(settings, seen_as.panel(patch.outline), depth)
+    low, high = np.maximum(seen.min(axis=0), -limit), np.minimum(seen.max(axis=0), limit)
+    if not np.all(low < high):
+        return None
+    bounds = ((float(low[0]), float(high[0])), (float(low[1]), float(high[1])))
+    return PatchForm(patch, seen, fit_warp(settings, seen_as, depth, bounds, patch.box))
 
 
 def accuracy_of(settings: HologramSettings) -> float:
@@ -205,6 +227,15 @@ def _grid(seen_as: Sight, reach: Array, inside: Array) -> SightGrid:
     """Return the grid over the sight rectangle whose sampling frequency exceeds `reach` + `inside`, radians per s."""
     half, centre = np.asarray(seen_as.to_panel.half), np.asarray(seen_as.to_panel.centre)
     step = 2 * np.pi / (1.01 * (reach + inside))
+    samples = float(np.prod(2 * half / step + 2 * _SPARE))
+    if not samples <= _MOST_SAMPLES:  # NaN too
+        raise SamplingError(
+            f"The panel's light needs {samples:.3g} samples to reach the pupil without aliasing; "
+            f"the limit is {_MOST_SAMPLES:.3g}.",
+            fix="Check the bench's misalignment, the pupil's diameter and the wavelength.",
+            measured=samples,
+            limit=_MOST_SAMPLES,
+        )
     columns, rows = (
         scipy.fft.next_fast_len(int(np.ceil(2 * h / d)) + 2 * _SPARE) for h, d in zip(half, step, strict=True)
     )

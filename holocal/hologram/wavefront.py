@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import isfinite
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -46,6 +47,14 @@ class Wavefront:
             raise InputError(
                 f"A wavefront of {len(self.noll)} Zernike terms and degree {self.degree} over the field needs "
                 f"{len(self.noll)} x {terms} coefficients.",
+            )
+        if not all(isfinite(c) for row in self.coefficients_rad for c in row):
+            raise InputError("A coefficient of the wavefront correction is not finite.")
+        if not (all(j >= 1 for j in self.noll) and min(*self.half_tan, self.wavelength_m) > 0 and self.degree >= 0):
+            raise InputError(
+                f"A wavefront of Noll indices {self.noll}, half width {self.half_tan}, degree {self.degree} and "
+                f"wavelength {self.wavelength_m:g} m has no meaning.",
+                fix="Noll indices start at 1; widths and the wavelength are above 0, the degree is not negative.",
             )
 
     def is_identity(self) -> bool:

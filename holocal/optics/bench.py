@@ -31,6 +31,13 @@ class Panel:
     height: int
     pitch_m: float
 
+    def __post_init__(self) -> None:
+        if not (self.width >= 1 and self.height >= 1 and 0 < self.pitch_m < np.inf):
+            raise ConfigError(
+                f"The panel is {self.width} x {self.height} pixels of {self.pitch_m * 1e6:g} um.",
+                fix="Give at least one pixel each way and a pitch above 0.",
+            )
+
     @property
     def x_m(self) -> Array:
         """Column centres, ascending, (width,) metres in S."""
@@ -62,6 +69,10 @@ class Pose:
 
     rotation_rad: Vector = (0.0, 0.0, 0.0)
     shift_m: Vector = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if not np.all(np.isfinite([*self.rotation_rad, *self.shift_m])):
+            raise ConfigError(f"A displacement is not finite: {self.rotation_rad} rad, {self.shift_m} m.")
 
     @cached_property
     def matrix(self) -> Array:
@@ -112,6 +123,21 @@ class Bench:
                 f"The eye is {t * 1e3:g} mm from the mirror; a focus is between "
                 f"{(a - focus) * 1e3:.2f} and {(a + focus) * 1e3:.2f} mm from every point of this ellipsoid.",
                 fix="Change eye_to_mirror_m.",
+            )
+        if not 0 < self.eye_relief_m < t:
+            raise ConfigError(
+                f"The pupil is {self.eye_relief_m * 1e3:g} mm in front of the eye's rotation centre.",
+                why="It must be between the centre, where the panel's image is, and the mirror.",
+                fix=f"Give eye_relief_m between 0 and {t:g}.",
+                measured=self.eye_relief_m,
+                limit=t,
+            )
+        if not 0 < self.pupil_diameter_m < 2 * b:
+            raise ConfigError(
+                f"The pupil's diameter is {self.pupil_diameter_m * 1e3:g} mm.",
+                fix=f"Give pupil_diameter_m above 0 and below the mirror's {2 * b:g}.",
+                measured=self.pupil_diameter_m,
+                limit=2 * b,
             )
 
     @classmethod

@@ -18,10 +18,13 @@ from numpy.typing import NDArray
 
 from holocal.errors import InputError
 from holocal.optics.bench import Array, Bench
-from holocal.optics.raytrace import Rays, trace_to_slm
+from holocal.optics.raytrace import Rays, landing_error, newton_step, trace_to_slm
 from holocal.optics.zernike import zernike, zernike_gradient
 
 NOLL_THESIS = 10  # thesis 3.1: N = 10 is below the diffraction limit
+_WIDEST_TAN = 1e6  # 0.2 seconds of arc from a right angle
+_MORE_STEPS = 12  # of Newton's search, while a ray through the pupil is not found
+_FARTHEST_M = 1.0  # a search that runs away stops here: far outside any mirror
 FAN_THESIS = 66  # thesis 3.1: 66 by 66 rays fill the pupil
 
 
@@ -41,10 +44,10 @@ class VirtualPoints:
         """Return points at tangents (..., 2) and one distance, or one each."""
         tangents = np.asarray(field_tan, np.float64)
         distance = np.broadcast_to(np.asarray(distance_m, np.float64), tangents.shape[:-1])
-        if not (np.all(np.isfinite(tangents)) and np.all(distance > 0)):
+        if not (np.all(np.abs(tangents) <= _WIDEST_TAN) and np.all(distance > 0)):  # NaN too
             raise InputError(
-                "A virtual point needs finite tangents and a distance above 0 m (infinity is one).",
-                measured=float(np.min(distance)),
+                f"A virtual point needs tangents within {_WIDEST_TAN:g} and a distance above 0 m (infinity is one).",
+                measured=float(np.min(distance, initial=np.inf)),
                 limit=0.0,
             )
         return cls(tangents, distance)
@@ -219,6 +222,11 @@ class ExactPhase:
     error_m: Array
 
 
+def _lost(bench: Bench, pupil_m: Array, error_m: Array) -> NDArray[np.bool_]:
+    """Return which rays cross the pupil, or nearly, without landing where they should."""
+    return np.asarray((np.linalg.norm(pupil_m, axis=-1) < bench.pupil_diameter_m) & ~(error_m < 1e-9))
+
+
 def exact_phase(
     bench: Bench,
     points: VirtualPoints,
@@ -231,21 +239,27 @@ def exact_phase(
     """Return phi of points (...) at panel points (..., 2), broadcast together: Newton's search for the pupil point.
 
     It starts from the ideal image of the panel at the eye's rotation centre. Inside the thesis's field and footprint
-    the rays land within 1e-12 m.
+    the rays land within 1e-12 m. `error_m` is infinite where the ray misses the mirror or the panel's plane.
     """
     relief = bench.eye_relief_m
     slm_m, tangents = np.broadcast_arrays(np.asarray(slm_m, np.float64), points.field_tan)
     inverse = (1.0 / points.distance_m)[..., None]
     pupil = (relief * tangents - slm_m / bench.magnification) / (1.0 + relief * inverse)
-    eps = 1e-6  # metres; a one-sided difference will do: the slope only steers, the landing decides
+    pupil = np.clip(pupil, -_FARTHEST_M, _FARTHEST_M)
+    # metres; a one-sided difference will do: the slope only steers, the landing decides. Through a point d in front of
+    # the pupil, a step of d turns the ray by a radian: nearer than a centimetre the step must be smaller.
+    eps = np.minimum(1e-6, 1e-4 / np.maximum(inverse, 1e-300))
     jacobian = np.empty((*slm_m.shape[:-1], 2, 2))
     rays = trace_points(bench, points, pupil, gaze_rad)
-    for step in range(steps):
-        if step < 2:  # the map is smooth: a slope from near the solution serves the last steps
-            for j, shift in enumerate(np.eye(2) * eps):
-                moved = trace_points(bench, points, pupil + shift, gaze_rad).landing_m
+    for step in range(steps + _MORE_STEPS):
+        if step >= steps and not np.any(_lost(bench, pupil, landing_error(rays, slm_m))):
+            break
+        # the map is smooth: a slope from near the solution serves the last steps; far misaligned ones need more
+        if step < 2 or step >= steps:
+            for j, axis in enumerate(np.eye(2)):
+                moved = trace_points(bench, points, pupil + axis * eps, gaze_rad).landing_m
                 jacobian[..., j] = (moved - rays.landing_m) / eps
-        pupil = pupil + np.linalg.solve(jacobian, (slm_m - rays.landing_m)[..., None])[..., 0]
+        pupil = np.clip(pupil + newton_step(jacobian, slm_m - rays.landing_m), -_FARTHEST_M, _FARTHEST_M)
         rays = trace_points(bench, points, pupil, gaze_rad)
-    error = np.linalg.norm(rays.landing_m - slm_m, axis=-1)
+    error = landing_error(rays, slm_m)
     return ExactPhase(traced_phase(points, pupil, rays, wavelength_m=wavelength_m), pupil, error)

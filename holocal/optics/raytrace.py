@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from holocal.optics.bench import Array, Bench
 
+_WIDEST_TAN = 1e6  # a search that runs away stops here: 0.2 seconds of arc from a right angle
+
 
 @dataclass(frozen=True)
 class Rays:
@@ -93,6 +95,23 @@ def trace_to_pupil(bench: Bench, slm_m: Array, direction_s: Array, gaze_rad: tup
     return Rays(landing, to_mirror, from_mirror, reflected @ axes, hit & ahead)
 
 
+def newton_step(slope: Array, wanted: Array) -> Array:
+    """Return the steps (..., 2) that change a landing by `wanted` (..., 2), for slopes (..., 2, 2).
+
+    0 where the slope is singular or not finite: the search stays where it is, and its landing error says so.
+    """
+    determinant = slope[..., 0, 0] * slope[..., 1, 1] - slope[..., 0, 1] * slope[..., 1, 0]
+    solvable = np.isfinite(determinant) & (np.abs(determinant) > 1e-300)
+    safe = np.where(solvable[..., None, None], slope, np.eye(2))
+    return np.asarray(np.where(solvable[..., None], np.linalg.solve(safe, wanted[..., None])[..., 0], 0.0))
+
+
+def landing_error(rays: Rays, slm_m: Array) -> Array:
+    """Return how far rays land from panel points (..., 2), metres; infinite where they miss the mirror or the plane."""
+    error = np.linalg.norm(rays.landing_m - slm_m, axis=-1)
+    return np.asarray(np.where(rays.valid & np.isfinite(error), error, np.inf))
+
+
 @dataclass(frozen=True)
 class Connection:
     """The ray between a pupil point and a panel point.
@@ -120,7 +139,8 @@ def connect(
     """Find the ray between panel points (..., 2) in S and pupil points (..., 2) in P by Newton's method.
 
     Starts from the ideal image of the panel at the eye's rotation centre. `error_m` says how far from the panel point
-    the ray lands: below 1e-12 m everywhere in the thesis's field, misaligned by degrees or not.
+    the ray lands: below 1e-12 m everywhere in the thesis's field, misaligned by degrees or not. It is infinite where
+    the last ray misses the mirror or the panel's plane: no such ray was found.
     """
     slm_m, pupil_m = np.broadcast_arrays(np.asarray(slm_m, float), np.asarray(pupil_m, float))
     axes = bench.pupil_axes(gaze_rad)
@@ -142,7 +162,7 @@ def connect(
                 ahead[..., j] += eps
                 behind[..., j] -= eps
                 mixed[..., j] = (shoot(ahead).landing_m - shoot(behind).landing_m) / (2 * eps)
-        tangents = tangents + np.linalg.solve(mixed, (slm_m - rays.landing_m)[..., None])[..., 0]
+        tangents = np.clip(tangents + newton_step(mixed, slm_m - rays.landing_m), -_WIDEST_TAN, _WIDEST_TAN)
         rays = shoot(tangents)
-    error = np.linalg.norm(rays.landing_m - slm_m, axis=-1)
+    error = landing_error(rays, slm_m)
     return Connection(rays.to_mirror_m + rays.from_mirror_m, tangents, -rays.direction, mixed, error)

@@ -49,7 +49,8 @@ def test_everything_a_plan_depends_on_has_its_own_key():
 
 
 def test_a_second_program_finds_the_plan_and_makes_the_same_hologram(tmp_path):
-    cloud = PointCloud(np.array([[0.01, -0.02], [-0.03, 0.0]]), np.full(2, np.inf), np.ones(2), np.zeros(2))
+    tangents = np.stack(np.meshgrid([-0.03, 0.01, 0.02], [0.0, 0.015, -0.02]), axis=-1).reshape(-1, 2)
+    cloud = PointCloud(tangents, np.full(9, np.inf), np.ones(9), np.zeros(9))
     fields = []
     for settings in (SETTINGS, replace(SETTINGS, gaze_rad=(0.0, 0.0))):
         found = synthesise([cloud], settings, reach=(99, 99), clock=Clock.start(), store=ArrayCache(tmp_path))

@@ -7,11 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from holocal.errors import SamplingError
+from holocal.hologram import direct, synthesis
 from holocal.hologram.clock import Clock
 from holocal.hologram.depths import depth_bins
 from holocal.hologram.direct import direct_hologram, direct_sum
 from holocal.hologram.footprint import transmission
-from holocal.hologram.pipeline import HologramSettings, render
+from holocal.hologram.pipeline import HologramSettings
 from holocal.hologram.reference import reference_turns
 from holocal.hologram.scenes.points import Aperture, PointCloud
 from holocal.hologram.settings import Direct, Warped
@@ -29,6 +31,12 @@ FULL = HologramSettings(Panel(3840, 2160, 3.74e-6), Bench(), 515e-9, (25 * DEG, 
 COARSE = replace(FULL, panel=Panel(960, 540, 4 * 3.74e-6), fov_rad=(6 * DEG, 5 * DEG))
 SMALL = replace(FULL, panel=Panel(960, 540, 3.74e-6), fov_rad=(12 * DEG, 10 * DEG))
 MISALIGNED = Bench(mirror=Pose((0.3 * DEG, -0.2 * DEG, 0.3 * DEG), (3e-4, -2e-4, 3e-4)))
+
+
+@pytest.fixture(autouse=True)
+def by_patches(monkeypatch):
+    """However few the points: a scene of a handful would be summed point by point."""
+    monkeypatch.setattr(synthesis, "_FEW", 0)
 
 
 def cloud(settings, count, *, seed=0, distance=np.inf, aperture=None):
@@ -223,8 +231,9 @@ def test_points_in_a_convex_outline_are_found():
 
 def test_patches_that_show_no_lit_point_are_left_out_and_named():
     corner = replace(cloud(FULL, 4), field_tan=np.tan(12 * DEG) * np.array([[1.0, 1], [0.99, 1], [1, 0.99], [0.98, 1]]))
-    rendered = render([corner], replace(FULL, panel=Panel(960, 540, 4 * 3.74e-6), iterations=1))
-    assert any("patches of the panel: show no lit point" in sentence for sentence in rendered.skipped)
+    coarse = replace(FULL, panel=Panel(960, 540, 4 * 3.74e-6))
+    found = synthesise([corner], coarse, reach=(9, 9), clock=Clock.start())
+    assert any("patches of the panel: show no lit point" in sentence for sentence in found.skipped)
 
 
 def test_the_same_points_with_another_brightness_use_the_same_plans():
@@ -244,3 +253,26 @@ def test_the_direct_hologram_of_a_large_panel_is_interpolated_well():
     rows, columns, slm = some_pixels(COARSE.panel, 300)
     found = direct_hologram(COARSE, [scene])[rows, columns]
     assert np.abs(found - direct_sum(COARSE, [scene], slm)).max() < 2e-3
+
+
+def test_a_depth_with_few_points_is_summed_point_by_point(monkeypatch):
+    monkeypatch.undo()
+    far, near = cloud(SMALL, 40), cloud(SMALL, 3, seed=8, distance=0.37)
+    assert relative_error([far, near], SMALL) < 0.1
+    assert relative_error([near], SMALL) < 1e-3  # only traced: no patch, no mask
+    clock = Clock.start()
+    synthesise([near], SMALL, reach=(9, 9), clock=clock)
+    assert "plans" not in clock.seconds
+
+
+def test_points_that_light_nothing_of_the_panel_are_no_hologram(monkeypatch):
+    monkeypatch.undo()
+    aside = replace(cloud(SMALL, 2), field_tan=np.array([[0.5, 0.4], [0.5, -0.4]]))
+    for settings in (SMALL, replace(SMALL, method=Direct())):
+        assert synthesise([aside], settings, reach=(9, 9), clock=Clock.start()) is None
+
+
+def test_a_point_whose_phase_is_not_smooth_over_the_panel_is_refused(monkeypatch):
+    monkeypatch.setattr(direct, "_TAIL_RAD", 1e-13)  # as if rounding were a wiggle
+    with pytest.raises(SamplingError, match="not smooth over the panel"):
+        direct_hologram(SMALL, [cloud(SMALL, 1, distance=2.0)])
