@@ -91,9 +91,9 @@ def _add_wave(total: NDArray[np.complex64], settings: HologramSettings, one: Poi
         lit = np.flatnonzero(near.any(axis=0))
         columns = slice(int(lit[0]), int(lit[-1]) + 1)
         pupil = np.stack([x[:, columns], y[:, columns]], axis=-1)
-        turns = rows @ tables[0][:, columns]
+        turns = rows @ tables[0][:, columns] + one.phase_rad[0] / (2 * np.pi)
         turns -= np.round(turns)
-        phase = (2 * np.pi * turns + one.phase_rad[0]).astype(np.float32)
+        phase = (2 * np.pi * turns).astype(np.float32)
         modulus = (one.amplitude[0] * transmission(pupil, diameter, one.aperture)).astype(np.float32)
         field = total[part, columns]
         field.real += modulus * np.cos(phase)

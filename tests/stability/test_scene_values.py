@@ -131,7 +131,7 @@ def test_a_turn_more_of_initial_phase_changes_nothing(phase):
     reduced = replace(scene, phase_rad=np.array([0.3, np.angle(np.exp(1j * phase))]))
     one, other = (render([s], replace(BASE, iterations=0), keep_complex=True).field for s in (scene, reduced))
     # 1e8 rad are held to 1e-8; float32 leaves 1e-6 of two points' field
-    assert np.abs(one - other).max() < 5e-5  # single-precision sums of amplitudes near 1
+    assert np.abs(one - other).max() < 1e-5
 
 
 def test_the_same_scene_gives_the_same_bytes_from_one_thread_and_from_two():
