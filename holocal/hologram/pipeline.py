@@ -30,6 +30,7 @@ from holocal.hologram.synthesis import synthesise
 __all__ = ["HologramSettings", "Rendered", "render", "render_image", "render_images"]
 
 _BLOCK = 128  # rows at a time: float64 work that stays in the cache
+_WIDEST = 1.2  # times the band: the pupil's image is largest at one side of the panel, half as wide at the other
 _MARGIN_BINS = 2.0  # the window is this much wider than the pupil's image: half a pixel of the footprint's edge
 
 
@@ -206,14 +207,14 @@ def _check_band(settings: HologramSettings) -> None:
     """Refuse a pupil whose light the panel's pixels cannot tell apart: it would come back on the pupil's other side."""
     band = 0.5 / settings.panel.pitch_m
     widest = max(_window(_where(settings)).half_size_per_m)
-    if not widest <= band:
+    if not widest <= _WIDEST * band:
         raise SamplingError(
             f"The pupil's image is {widest / band:.2f} times as wide as the panel's band, at "
             f"{settings.wavelength_m * 1e9:.4g} nm and {settings.panel.pitch_m * 1e6:.3g} um.",
             why="Light for its rim would alias to the other side.",
             fix="Use a smaller pupil or gaze, a longer wavelength or a finer pitch.",
             measured=widest,
-            limit=band,
+            limit=_WIDEST * band,
         )
 
 

@@ -22,7 +22,20 @@ def test_help_imports_nothing_heavy():
 
 @pytest.mark.parametrize(
     "command",
-    ["run", "resume", "accept", "report", "show", "verify", "render", "capture", "rigs", "procedures", "doctor"],
+    [
+        "run",
+        "resume",
+        "accept",
+        "report",
+        "show",
+        "verify",
+        "render",
+        "capture",
+        "bench",
+        "rigs",
+        "procedures",
+        "doctor",
+    ],
 )
 def test_every_command_has_help(holocal, command):
     answer = holocal(command, "--help")

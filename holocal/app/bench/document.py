@@ -34,7 +34,7 @@ NOTES = {
     "quality": "512 x 512 photographs in the far field of 1024 x 1024 pixels, free outside the image. PSNR of "
     "amplitudes, peak 1, fitted scale. `camera`: 4 x 4 samples averaged over each image pixel; `half off`: the same "
     "camera moved by half an image pixel both ways. Error on the grid says little about what a camera sees.",
-    "propagation": "Float32; a disc of 0.5 mm with an edge of 2 pixels against the Rayleigh-Sommerfeld sum at 400 "
+    "propagation": "Float32; a disc of 0.5 mm with an edge of 2 pixels against the Rayleigh-Sommerfeld sum at 48 "
     "random pixels; times with the kernel prepared, padded to twice the size.",
 }
 COLUMNS: dict[str, tuple[tuple[str, str, str], ...]] = {

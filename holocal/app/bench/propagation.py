@@ -17,11 +17,11 @@ from holocal.optics.propagate import Propagator, propagate, rayleigh_sommerfeld_
 Row = dict[str, Any]
 PITCH_M, WAVELENGTH_M = 3.74e-6, 515e-9
 DISTANCES_M = (1e-3, 5e-3, 13e-3, 15e-3, 50e-3, 200e-3, 1.0)
-_FINER, _PIXELS = 4, 256
+_FINER, _PIXELS, _JUDGED = 4, 256, 48
 
 
 def errors() -> Iterator[Row]:
-    """Yield a row per distance: relative L2 error in float32 of a soft-edged disc, 256 x 256, at 400 random pixels.
+    """Yield a row per distance: relative L2 error in float32 of a soft-edged disc, 256 x 256, at random pixels.
 
     The sum runs over samples four times finer: where pixels alone would alias, it does not.
     """
@@ -34,7 +34,9 @@ def errors() -> Iterator[Row]:
         fine, np.meshgrid((middle - line[0]) / fine_pitch, (middle - line[0]) / fine_pitch, indexing="ij"), order=5
     )
     rng = np.random.default_rng(0)
-    rows, columns = rng.integers(64, 192, 400), rng.integers(64, 192, 400)
+    rows, columns = rng.integers(64, 192, _JUDGED), rng.integers(64, 192, _JUDGED)
+    lit = slice(int(np.flatnonzero(fine.any(axis=0))[0]), int(np.flatnonzero(fine.any(axis=0))[-1]) + 1)  # symmetric
+    fine = fine[lit, lit]
     at = np.stack([middle[columns], -middle[rows]], axis=-1)
     for distance in DISTANCES_M:
         shared = {"pitch_m": PITCH_M, "wavelength_m": WAVELENGTH_M, "distance_m": distance}
