@@ -29,8 +29,8 @@ from holocal.hologram.zone_sum import zones_on_panel
 from holocal.hologram.zones import zone_plan
 from holocal.optics.bench import Array
 
-_ENGINES_KEPT = 2  # 0.25 GB each on the 4K panel
-_KEPT = 2  # sets of points whose transforms are kept: 0.25 GB each for 750 x 750 points on the 4K panel
+_ENGINES_KEPT = 2  # 0.7 GB each on the 4K panel, points included
+_KEPT = 1  # sets of points whose transforms are kept: 0.5 GB for 750 x 750 points on the 4K panel
 _NEAREST_M = 1e-6  # a point nearer than a few waves to the pupil is not seen through it
 _WIDEST_TAN = 1e6  # 0.2 seconds of arc from a right angle
 _LARGEST_PHASE = 1e9  # rad: float64 holds it to 1e-7
@@ -242,10 +242,10 @@ class WarpedEngine:
                     measured=plan.error_rad,
                     limit=accuracy,
                 )
+            while len(self.kept) >= _KEPT:  # first, so that one too many is never there
+                self.kept.popitem(last=False)
             sums = patch_sums(plan, field_tan, tolerance=tolerance_of(self.settings))
         self.kept[key] = sums
-        while len(self.kept) > _KEPT:
-            self.kept.popitem(last=False)
         return sums
 
 

@@ -9,7 +9,7 @@ Sorting points and samples takes as long as summing them: what depends only on w
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import finufft
 import numpy as np
@@ -50,15 +50,13 @@ class PatchSum:
     factor: Complex
     plan: finufft.Plan
     keep: tuple[Floats, ...]
-    buffer: Complex = field(repr=False)
 
     def write_to(self, total: Complex, strengths: Complex) -> None:
         """Write the patch's sum over its points to its part of the grid."""
         chosen = strengths[self.index]
         chosen *= self.point_phasor
-        self.plan.execute(chosen, out=self.buffer)
         part = total[self.patch.rows, self.patch.columns]
-        np.multiply(self.buffer.reshape(part.shape), self.factor, out=part)
+        np.multiply(self.plan.execute(chosen).reshape(part.shape), self.factor, out=part)
 
 
 @dataclass
@@ -112,8 +110,7 @@ def _patch_sum(
     with _PLANNING:
         plan = finufft.Plan(3, 2, 1, tolerance, 1, dtype="complex64", **_options(1))
         plan.setpts(*sources, None, *targets)
-    buffer = np.empty(len(targets[0]), np.complex64)
-    return PatchSum(patch, index, phasor(ub[:, 2]), factor, plan, (*sources, *targets), buffer)
+    return PatchSum(patch, index, phasor(ub[:, 2]), factor, plan, (*sources, *targets))
 
 
 def phasor(phase_rad: Array) -> Complex:

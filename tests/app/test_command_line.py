@@ -110,3 +110,10 @@ def test_the_doctor_finds_a_healthy_bench_and_a_frozen_panel(holocal):
     ill = holocal("doctor", "--rig", "lab-bench", "--set", "faults.kind=frozen-panel", "--json")
     assert ill.status == 4
     assert "P10" in ill.json["error"]["what"]
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="glibc's allocator is Linux's")
+def test_the_allocator_is_told_to_give_memory_back():
+    asked = "from holocal.app.memory import return_freed_memory; print(return_freed_memory())"
+    done = subprocess.run([sys.executable, "-c", asked], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "True"

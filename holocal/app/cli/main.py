@@ -28,6 +28,7 @@ from holocal.app.cli import (
     show,
     verify,
 )
+from holocal.app.memory import return_freed_memory
 from holocal.errors import HolocalError, Interrupted
 
 # Small float64 products in several threads: with its own threads under ours, OpenBLAS made the simulated bench's set-up
@@ -112,6 +113,7 @@ def invoke(arguments: Sequence[str]) -> int:
 
 def main() -> None:
     """Run the command line of this process."""
+    return_freed_memory()
     sys.exit(invoke(sys.argv[1:]))
 
 
