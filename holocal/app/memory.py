@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import ctypes.util
 import sys
 from contextlib import suppress
 
@@ -18,6 +17,6 @@ def return_freed_memory() -> bool:
     if not sys.platform.startswith("linux"):
         return False
     with suppress(OSError, AttributeError):
-        library = ctypes.CDLL(ctypes.util.find_library("c") or "libc.so.6")
+        library = ctypes.CDLL("libc.so.6")
         return bool(library.mallopt(_M_MMAP_THRESHOLD, _MAPPED_BYTES) and library.mallopt(_M_ARENA_MAX, _ARENAS))
     return False
