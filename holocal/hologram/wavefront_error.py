@@ -102,7 +102,8 @@ def best_tilt_residual(phase_rad: Array, slm_m: Array, inside: Array) -> Array:
     enough = inside_count >= 12  # of 1300 samples; a plane takes three
     normal = np.einsum("nk,ki,kj->nij", inside[enough], plane, plane)
     right = np.einsum("nk,ki,nk->ni", inside[enough], plane, phase_rad[enough])
-    fitted = np.linalg.solve(normal, right[..., None])[..., 0] @ plane.T
+    # footprints that touch the panel in a line of samples have no tilt across it: the least one is taken
+    fitted = (np.linalg.pinv(normal, hermitian=True) @ right[..., None])[..., 0] @ plane.T
     rms = np.full(len(phase_rad), np.nan)
     rms[enough] = np.sqrt(np.sum(inside[enough] * (phase_rad[enough] - fitted) ** 2, axis=-1) / inside_count[enough])
     return rms
