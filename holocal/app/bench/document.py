@@ -75,6 +75,7 @@ COLUMNS: dict[str, tuple[tuple[str, str, str], ...]] = {
     "camera": (
         ("rig", "rig", ""),
         ("encoder", "encoder", ""),
+        ("start", "initial phase", ""),
         ("iterations", "iterations", ""),
         ("camera_db", "camera dB", ".1f"),
         ("efficiency", "efficiency", ".2f"),

@@ -24,6 +24,7 @@ from holocal.hologram.encode.ifta import Encoded
 from holocal.hologram.encode.ifta_encoder import Ifta
 from holocal.hologram.pipeline import HologramSettings, render_image, target_of
 from holocal.hologram.quality import encoder_table, photographs, psnr_db
+from holocal.hologram.scenes.image import QuadraticPhase, RandomPhase, ZeroPhase
 from holocal.hologram.settings import Warped
 from holocal.optics.bench import image_tangents
 from holocal.records.rig import load_rig
@@ -144,23 +145,29 @@ def bench_quality(*, rig: str = "simulated-ideal") -> Iterator[Row]:
             wavelength_m=wavelength_m,
             fov_rad=(float(np.deg2rad(SHOWN_DEG[0])), float(np.deg2rad(SHOWN_DEG[1]))),
         )
-        for encoder_name, encoder, count in (
-            ("IFTA", Ifta(10), 10),
-            ("IFTA", Ifta(50), 50),
-            ("gradient descent", GradientDescent(10), 10),
-            ("error diffusion", ErrorDiffusion(), 0),
-            ("double phase", DoublePhase(), 0),
+        smooth = QuadraticPhase(wavelength_m, settings.fov_rad, settings.bench.pupil_diameter_m)
+        for encoder_name, encoder, count, phase in (
+            ("IFTA", Ifta(10), 10, RandomPhase(3)),
+            ("IFTA", Ifta(50), 50, RandomPhase(3)),
+            ("IFTA", Ifta(10), 10, smooth),
+            ("IFTA", Ifta(50), 50, smooth),
+            ("IFTA", Ifta(50), 50, ZeroPhase()),
+            ("gradient descent", GradientDescent(10), 10, RandomPhase(3)),
+            ("error diffusion", ErrorDiffusion(), 0, RandomPhase(3)),
+            ("double phase", DoublePhase(), 0, RandomPhase(3)),
         ):
             shown = cv2.resize(image, _camera_pixels(settings, facts.camera.field_rad, facts.camera.width))
-            rendered = render_image(np.clip(shown, 0, 1), settings, seed=3, encoder=encoder)
+            shown = np.clip(shown, 0, 1)
+            rendered = render_image(shown, settings, seed=3, encoder=encoder, initial_phase=phase)
             frame = capture(device, rendered.levels, wavelength_m=wavelength_m, exposure_s=None)
             seen = np.asarray(frame.counts, np.float64)
             yield {
                 "table": "camera",
                 "rig": rig,
                 "encoder": encoder_name,
+                "start": {RandomPhase: "random", ZeroPhase: "zero"}.get(type(phase), "smooth"),
                 "iterations": count,
-                "camera_db": camera_psnr(seen, np.clip(shown, 0, 1), settings, facts.camera.field_rad),
+                "camera_db": camera_psnr(seen, shown, settings, facts.camera.field_rad),
                 "efficiency": rendered.efficiency,
             }
 
