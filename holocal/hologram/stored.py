@@ -20,7 +20,7 @@ from holocal.hologram.warp import Box, Depth, Warp
 from holocal.hologram.warped import Layout, Patch, PatchForm, SightGrid, WarpedPlan, accurate_plan, warped_plan
 from holocal.optics.bench import Array
 
-METHOD = 2  # raised whenever a plan of the same settings comes out different
+METHOD = 3  # raised whenever a plan of the same settings comes out different
 Arrays = Mapping[str, Array]
 
 

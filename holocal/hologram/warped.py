@@ -249,9 +249,9 @@ def visible_field(settings: HologramSettings, slm_m: Array, depth: Depth) -> Arr
     """Return the convex outline (n, 2) of the tangents at which panel points (k, 2) show points of a depth.
 
     With a margin: where a patch drops a point that its neighbour still has, the point's light ends abruptly, and what
-    that diffracts into the pupil falls with the distance from the rim. 8 % leave 0.04 of the field, 25 % 0.02.
+    that diffracts into the pupil falls with the distance from the rim. 8 % leave 0.04 of the field, 100 % 0.01.
     """
-    margin = 1.08 if accuracy_of(settings) >= 0.08 else 1.6
+    margin = 1.08 if accuracy_of(settings) >= _FINE_RAD else 2.0
     rim = pupil_rim(settings.bench.pupil_diameter_m * margin, 24)
     found = connect(settings.bench, slm_m[:, None], rim, gaze_rad=settings.gaze_rad).field_tan
     found = (found + rim * depth.inverse_m).reshape(-1, 2)  # the point's direction is taken from the pupil's centre

@@ -26,7 +26,8 @@ NOTES = {
     "random pixels of 200 random points against the direct float64 sum, same footprints (zones keep the "
     "thesis's wider ones).",
     "density": "The default method, 0.1 rad. `new points`: positions never seen before, so they are sorted first.",
-    "frame": "Plans warm. Stages are seconds, medians.",
+    "frame": "Plans warm. Stages are seconds, medians. `peak`: of the process so far; its own where this stage ran "
+    "alone.",
     "encoders": "`error`: rms of the window's spectrum against the scaled wanted one. `efficiency`: share of the "
     "panel's light that is wanted signal in the pupil.",
     "camera": "A photograph over 12 x 8 degrees through the simulated bench and its camera, which averages over its "
@@ -107,7 +108,7 @@ def as_markdown(rows: Sequence[Row], machine: Row, *, plots: Sequence[str] = ())
     lines = [
         "# Benchmarks",
         "",
-        "Made by `holocal bench --out docs`. P is a bare complex64 FFT and its inverse of the same size, two threads, "
+        "Made by `holocal bench`. P is a bare complex64 FFT and its inverse of the same size, two threads, "
         "the faster of scipy and torch, measured next to each run in the same process; times are medians. Machines are "
         "shared and noisy: compare ratios, and those to one digit.",
         "",
