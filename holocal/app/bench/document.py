@@ -154,28 +154,28 @@ def _draw_synthesis(rows: Sequence[Row], path: Path) -> bool:
     if not chosen:
         return False
     figure, axes = _axes("run time, FFT pairs of the same size", "relative L2 error against the direct sum")
-    for size, marker in zip(sorted({row["size"] for row in chosen}), "os^v", strict=False):
-        for row in (row for row in chosen if row["size"] == size):
-            at = (row["ratio_p"], row["relative_l2"])
-            axes.loglog(*at, marker, color="C0" if "warped" in row["method"] else "C3")
-            text = f"{row['method']}\n{size}"
-            axes.annotate(text, at, fontsize=6, xytext=(5, 3), textcoords="offset points")
+    methods = list(dict.fromkeys(row["method"] for row in chosen))
+    sizes = sorted({row["size"] for row in chosen})
+    for row in chosen:
+        colour, marker = f"C{methods.index(row['method']) % 10}", "os^v"[sizes.index(row["size"]) % 4]
+        axes.loglog(row["ratio_p"], row["relative_l2"], marker, color=colour, label=f"{row['method']}, {row['size']}")
+    axes.legend(fontsize=7)
     axes.set_title("Synthesis of 750 x 750 points")
     figure.savefig(path, dpi=110)
     return True
 
 
 def _draw_quality(rows: Sequence[Row], path: Path) -> bool:
-    """Draw camera PSNR against cost for every encoder; return whether there was anything to draw."""
+    """Draw camera PSNR against iterations for every encoder; return whether there was anything to draw."""
     chosen = [row for row in rows if row["table"] == "quality" and row["image"] == _first_image(rows)]
     if not chosen:
         return False
-    figure, axes = _axes("run time, FFT pairs of the panel's size", "PSNR as a camera sees it, dB")
+    figure, axes = _axes("iterations (one pass: 1)", "PSNR as a camera sees it, dB")
     names = sorted({(row["encoder"], row["grid"]) for row in chosen})
     for i, (name, grid) in enumerate(names):
         for start, marker in (("random", "o"), ("quadratic", "s")):
             of = [row for row in chosen if (row["encoder"], row["grid"], row["start"]) == (name, grid, start)]
-            x, y = [row["ratio_p"] for row in of], [row["camera_db"] for row in of]
+            x, y = [max(row["iterations"], 1) for row in of], [row["camera_db"] for row in of]
             label = f"{name}, {grid}, {start}"
             axes.semilogx(x, y, f"{marker}-", color=f"C{i % 10}", label=label, ms=4, lw=0.8)
     axes.legend(fontsize=5, ncols=2)
