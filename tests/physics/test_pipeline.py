@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from holocal.errors import InputError, UsageError
-from holocal.hologram.pipeline import HologramSettings, render_image, render_images
+from holocal.hologram.encode.ifta_encoder import Ifta
+from holocal.hologram.pipeline import HologramSettings, render, render_image, render_images
 from holocal.hologram.scenes.image import RandomPhase, ZeroPhase, image_cloud
 from holocal.hologram.settings import Warped, Zones
 from holocal.optics.bench import Bench, Panel, image_tangents
@@ -198,3 +199,14 @@ def test_amplitudes_are_roots_of_intensities_and_phases_are_the_choice():
     assert random.min() >= 0
     assert random.max() < 2 * np.pi
     assert np.array_equal(random, (np.random.default_rng(3).random((2, 2)) * 2 * np.pi).ravel())
+
+
+def test_a_warm_start_is_where_the_last_frame_ended():
+    image = np.random.default_rng(2).random((40, 40))
+    cloud = image_cloud(image, fov_rad=SETTINGS.fov_rad, initial_phase=RandomPhase(0))
+    moved = image_cloud(np.roll(image, 1, axis=1), fov_rad=SETTINGS.fov_rad, initial_phase=RandomPhase(0))
+    last = render([cloud], SETTINGS, keep_encoded=True)
+    again = render([cloud], SETTINGS, encoder=Ifta(1, warm=last.encoded))
+    assert again.signal_error[0] == pytest.approx(last.signal_error[-1], rel=0.05)
+    cold = render([moved], SETTINGS, encoder=Ifta(1)).signal_error[0]
+    assert again.signal_error[0] < 0.5 * cold
