@@ -2,7 +2,6 @@
 
 ==============  ==========================================================
 cli             the command line, one file per command
-plugins         what entry points offer; a broken one stops nothing
 session         a rig, its lock, its corrections and a run put together
 configuration   ``--set``, parameters, and ``config.toml`` with origins
 corrections     accepted maps applied to a scene

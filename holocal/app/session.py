@@ -10,14 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from holocal import __version__
-from holocal.app import configuration, plugins
+from holocal.app import configuration
 from holocal.app.report import render_report
 from holocal.errors import DeviceError, RefusedError
 from holocal.loop.devices import Rig
 from holocal.loop.lock import locked
 from holocal.loop.record import RunRecord
 from holocal.loop.runner import Observer, RunResult, run
-from holocal.records import calibration
+from holocal.records import calibration, plugins
 from holocal.records.files import read_json
 from holocal.records.rig import RigConfig, identity
 

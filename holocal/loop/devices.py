@@ -38,6 +38,27 @@ class Frame:
     lost_packets: int = 0
 
 
+@dataclass(frozen=True)
+class Finding:
+    """What a device says of its own set-up: `ok` None where it cannot be known (a virtual output has no gamma ramp)."""
+
+    title: str
+    measured: float | str
+    limit: float | str
+    unit: str
+    ok: bool | None
+    remedy: str
+
+
+@runtime_checkable
+class Inspectable(Protocol):
+    """What an SLM, a camera or a light adds when it can say how it is set up; the pre-flight asks, without light."""
+
+    def inspect(self) -> tuple[Finding, ...]:
+        """Return the findings: for an output its mode, rotation, gamma ramp; for a camera automatic gain, and so on."""
+        ...
+
+
 @runtime_checkable
 class Slm(Protocol):
     """A phase panel: takes levels, never radians."""

@@ -2,6 +2,7 @@
 
 ==============  ==========================================================
 facts           what a rig says of itself: panel, camera, wavelengths
+plugins         what entry points offer; a broken one stops nothing
 rig             a rig's file: found, typed, fingerprinted
 rig_model       the simulated rig's file: every key with its range
 validate        pydantic's complaints as errors that name file and key

@@ -19,11 +19,11 @@ def doctor(
     debug: options.Debug = False,
 ) -> None:
     """Check packages, plug-ins and a rig: what is there, what is broken, what to do."""
-    from holocal.app import plugins
     from holocal.app.configuration import rig_config
     from holocal.app.terminal import Terminal, emit, emit_json
     from holocal.errors import RefusedError
     from holocal.loop.environment import environment
+    from holocal.records import plugins
 
     config = rig_config(rig, set_ or [], device=options.checked_device(device))
     surroundings = environment()

@@ -7,8 +7,8 @@ from holocal.app.cli import options
 
 def procedures(json: options.Json = False, debug: options.Debug = False) -> None:
     """List the procedures that are installed, plug-ins included."""
-    from holocal.app import plugins
     from holocal.app.terminal import emit, emit_json
+    from holocal.records import plugins
 
     found = plugins.plugins(plugins.PROCEDURES)
     listed = [

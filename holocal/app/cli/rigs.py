@@ -7,8 +7,8 @@ from holocal.app.cli import options
 
 def rigs(json: options.Json = False, debug: options.Debug = False) -> None:
     """List the rigs that are installed, plug-ins included."""
-    from holocal.app import plugins
     from holocal.app.terminal import emit, emit_json
+    from holocal.records import plugins
     from holocal.records.rig import built_in_rigs, load_rig
 
     kinds = plugins.plugins(plugins.RIGS)

@@ -1,4 +1,4 @@
-"""What installed packages offer as rigs and procedures. A broken one is listed with its error and stops nothing."""
+"""What installed packages offer as rigs, procedures and drivers. A broken one is listed with its error."""
 
 from __future__ import annotations
 
@@ -11,6 +11,16 @@ from holocal.records.validate import closest
 
 RIGS = "holocal.rigs"
 PROCEDURES = "holocal.procedures"
+SLMS = "holocal.slms"
+CAMERAS = "holocal.cameras"
+LIGHTS = "holocal.lights"
+KINDS = {
+    RIGS: "rig kind",
+    PROCEDURES: "procedure",
+    SLMS: "SLM driver",
+    CAMERAS: "camera driver",
+    LIGHTS: "light driver",
+}
 
 
 @dataclass(frozen=True)
@@ -33,7 +43,7 @@ def plugins(group: str) -> list[Plugin]:
 def load(group: str, name: str) -> Any:
     """Return what the plug-in `name` gives; `ConfigError` when it is unknown or broken."""
     known = {point.name: point for point in entry_points(group=group)}
-    what = "rig kind" if group == RIGS else "procedure"
+    what = KINDS[group]
     if name not in known:
         raise ConfigError(
             f"the {what} {name!r} is not known.{closest(name, known)}",
