@@ -22,6 +22,7 @@ from holocal.hologram.synthesis import synthesise
 from holocal.hologram.warp import Depth
 from holocal.hologram.warped import accurate_plan, inside_outline, warped_plan
 from holocal.hologram.wavefront import Wavefront
+from holocal.hologram.wavefront_error import patch_wavefront_errors
 from holocal.optics.bench import Bench, Panel, Pose
 from holocal.optics.phase_function import VirtualPoints, exact_phase
 
@@ -83,6 +84,11 @@ def test_the_error_against_the_direct_sum_is_below_the_one_asked_for(settings, a
 def test_the_error_at_4k_is_below_the_one_asked_for(accuracy):
     settings = replace(FULL, method=Warped(accuracy))
     assert relative_error([cloud(settings, 300)], settings) < accuracy
+
+
+def test_the_table_of_errors_is_of_the_settings_depth():
+    settings = replace(COARSE, depth_m=0.4, method=Warped(0.1))
+    assert np.nanmax(patch_wavefront_errors(settings, samples=5)) < 0.1  # the plan for infinity is 9 rad off there
 
 
 @pytest.mark.parametrize("depth", [Depth(0.0), Depth(4.0), Depth(4.0, flat=True)], ids=["far", "25 cm", "25 cm, flat"])
