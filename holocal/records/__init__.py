@@ -15,6 +15,7 @@ scene_points    points in a CSV file
 scene_layers    images with depths, listed in a TOML file
 scene_mesh      a mesh in an OBJ or PLY file
 scene_views     the views of a light field, listed in a TOML file
+reading         a user's file opened, and what goes wrong said
 scene_toml      what the two lists have in common
 manifest        SHA-256 and size of every file of a run
 calibration     which accepted runs are in force for a rig
