@@ -22,6 +22,7 @@ from holocal.records.scene_data import Array, Mesh
 
 LARGEST_FILE_BYTES = 2**28
 MOST_FACES = 20_000_000
+# trimesh has no error of its own: on damaged files it raises any of these, found by fuzzing
 _PARSING = (ValueError, IndexError, KeyError, TypeError, AttributeError, OverflowError, NotImplementedError)
 
 
