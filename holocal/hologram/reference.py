@@ -7,6 +7,7 @@ Divided by it, a hologram's spectrum is an image of the pupil's plane (docs/phys
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,9 +24,17 @@ _DEGREE = 12
 
 
 def reference_turns(settings: HologramSettings) -> Series:
-    """Return the reference's phase psi0 on the panel, in turns (2 pi rad): minus the path from the pupil's centre."""
+    """Return the reference's phase psi0 on the panel, in turns (2 pi rad): minus the path from the pupil's centre.
+
+    Traced once (10 ms) for the last few settings.
+    """
+    return _reference_turns(settings.geometry())
+
+
+@lru_cache(maxsize=4)
+def _reference_turns(where: HologramSettings) -> Series:
     return fit_series(
-        lambda slm_m: turns_at(settings, slm_m), degree=_DEGREE, centre=(0.0, 0.0), half=settings.panel.half_size_m
+        lambda slm_m: turns_at(where, slm_m), degree=_DEGREE, centre=(0.0, 0.0), half=where.panel.half_size_m
     )
 
 

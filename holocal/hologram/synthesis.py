@@ -233,7 +233,7 @@ def _digest(values: NDArray[np.float64]) -> bytes:
 
 def _engine(settings: HologramSettings, store: Store | None) -> WarpedEngine:
     """Return the engine of a setting, whatever its depth and number of iterations."""
-    return _ENGINES.of(replace(settings, depth_m=np.inf, iterations=0, device="cpu"), store)
+    return _ENGINES.of(settings.of_plans(), store)
 
 
 @dataclass
