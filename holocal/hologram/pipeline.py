@@ -27,7 +27,7 @@ from holocal.hologram.settings import HologramSettings
 from holocal.hologram.stored import Store
 from holocal.hologram.synthesis import synthesise
 
-__all__ = ["HologramSettings", "Rendered", "render", "render_image", "render_images"]
+__all__ = ["HologramSettings", "Rendered", "render", "render_image"]
 
 _BLOCK = 128  # rows at a time: float64 work that stays in the cache
 _WIDEST = 1.2  # times the band: the pupil's image is largest at one side of the panel, half as wide at the other
@@ -153,21 +153,6 @@ def render_image(
     choice = initial_phase or RandomPhase(seed)
     cloud = image_cloud(intensity, fov_rad=settings.fov_rad, depth_m=settings.depth_m, initial_phase=choice)
     return render([cloud], settings, encoder=encoder, keep_complex=keep_complex, response_rad=response_rad)
-
-
-def render_images(
-    intensity: ArrayLike,
-    settings: HologramSettings,
-    *,
-    seeds: Sequence[int],
-    keep_complex: bool = False,
-    response_rad: ArrayLike | None = None,
-) -> list[Rendered]:
-    """Return one frame per seed of the same image, as `render_image` would."""
-    return [
-        render_image(intensity, settings, seed=seed, keep_complex=keep_complex, response_rad=response_rad)
-        for seed in seeds
-    ]
 
 
 @lru_cache(maxsize=4)
