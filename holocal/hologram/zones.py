@@ -11,12 +11,11 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.polynomial import chebyshev
 from scipy.spatial import ConvexHull
 
 from holocal.hologram.footprint import sample_footprint
 from holocal.hologram.reference import PupilWindow, pupil_window, reference_turns
-from holocal.hologram.series import Series, fit_series
+from holocal.hologram.series import Series, chebyshev_products, fit_series
 from holocal.hologram.settings import HologramSettings, Zones
 from holocal.optics.bench import Array
 from holocal.optics.phase_function import PhaseFunctions, VirtualPoints, phase_functions, pupil_rim, trace_points
@@ -96,9 +95,7 @@ class PointTable:
 
 def _field_basis(field_tan: Array, half_tan: tuple[float, float], degree: int) -> Array:
     """Return the Chebyshev products of total degree up to `degree`, (n, terms)."""
-    x = chebyshev.chebvander(field_tan[:, 0] / half_tan[0], degree)
-    y = chebyshev.chebvander(field_tan[:, 1] / half_tan[1], degree)
-    return np.stack([x[:, i] * y[:, j] for i in range(degree + 1) for j in range(degree + 1 - i)], axis=-1)
+    return chebyshev_products(field_tan[:, 0] / half_tan[0], field_tan[:, 1] / half_tan[1], degree)
 
 
 def zone_count(settings: HologramSettings) -> int:
