@@ -232,14 +232,8 @@ def _band(factor: Series, shift: Series, samples: Array) -> tuple[float, float]:
         ahead, behind = samples.copy(), samples.copy()
         ahead[:, axis] += step
         behind[:, axis] -= step
-        own = (_at(factor, ahead) - _at(factor, behind)) / (2 * step)
+        own = (factor.at(ahead) - factor.at(behind)) / (2 * step)
         corner = np.array([-1.0, 1.0])
         tilt = shift.on_grid(shift.centre[0] + corner * shift.half[0], shift.centre[1] + corner * shift.half[1])
         found.append(float(np.max(np.abs(own[:, None] + tilt[..., axis].ravel()))))
     return found[0], found[1]
-
-
-def _at(series: Series, points: Array) -> Array:
-    """Return a series at scattered points (n, 2)."""
-    in_y, in_x = series.bases(points[:, 0], points[:, 1])
-    return np.asarray(np.einsum("ni,ij...,nj->n...", in_y, series.coefficients, in_x))
