@@ -7,6 +7,7 @@ rig             a rig's file: found, typed, fingerprinted
 rig_model       the simulated rig's file: every key with its range
 validate        pydantic's complaints as errors that name file and key
 files           atomic writes, JSON, TOML
+reading         files that a user names: size checked, errors as sentences
 maps            OpenEXR of named channels
 frames          PNG: what the panel is sent, and camera counts
 scene           a scene image -> intensity, checked at the border

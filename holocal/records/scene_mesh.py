@@ -17,13 +17,13 @@ import trimesh
 
 from holocal.errors import InputError
 from holocal.records.files import one_line
-from holocal.records.reading import bytes_of
+from holocal.records.reading import checked_bytes
 from holocal.records.scene import LUMINANCE, linear
 from holocal.records.scene_data import Array, Mesh
 
 LARGEST_FILE_BYTES = 2**28
 MOST_FACES = 20_000_000
-# What trimesh raised on files that fuzzing damaged: it promises no error of its own.
+# trimesh has no error of its own: on damaged files it raises any of these, found by fuzzing
 _PARSING = (ValueError, IndexError, KeyError, TypeError, AttributeError, OverflowError, NotImplementedError)
 
 
@@ -45,9 +45,10 @@ def read_mesh(path: Path, *, srgb: bool = False) -> Mesh:
     kind = path.suffix.lower().removeprefix(".")
     if kind not in ("obj", "ply"):
         raise InputError(f"{path} is not an .obj or .ply file.", fix="Export the mesh as one of these.", measured=kind)
-    data = bytes_of(
+    data = checked_bytes(
         path,
-        at_most=LARGEST_FILE_BYTES,
+        largest_bytes=LARGEST_FILE_BYTES,
+        what="a mesh",
         fix="Simplify the mesh; a view of 750 x 750 pixels shows half a million triangles at most.",
     )
     if kind == "obj":

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel
 
 from holocal.errors import ConfigError, InputError
-from holocal.records.reading import text_of
+from holocal.records.reading import checked_text
 from holocal.records.validate import validated
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -21,7 +21,12 @@ LARGEST_FILE_BYTES = 4 * 2**20  # a thousand views are 100 KB
 
 def read_tables(path: Path) -> dict[str, Any]:
     """Return a TOML file's tables without its schema, or raise InputError: absent, not TOML, another schema."""
-    text = text_of(path, at_most=LARGEST_FILE_BYTES, fix="Give the TOML file that lists the images.")
+    text = checked_text(
+        path,
+        largest_bytes=LARGEST_FILE_BYTES,
+        what="a list of images",
+        fix="Give the TOML file that lists the images.",
+    )
     try:
         tables = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:

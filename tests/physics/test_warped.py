@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from random_points import cloud
 
 from holocal.errors import SamplingError
 from holocal.hologram import direct, synthesis
@@ -38,18 +39,6 @@ MISALIGNED = Bench(mirror=Pose((0.3 * DEG, -0.2 * DEG, 0.3 * DEG), (3e-4, -2e-4,
 def by_patches(monkeypatch):
     """However few the points: a scene of a handful would be summed point by point."""
     monkeypatch.setattr(synthesis, "_FEW", 0)
-
-
-def cloud(settings, count, *, seed=0, distance=np.inf, aperture=None):
-    rng = np.random.default_rng(seed)
-    half = np.tan(np.asarray(settings.fov_rad) / 2)
-    return PointCloud(
-        rng.uniform(-1, 1, (count, 2)) * half,
-        np.broadcast_to(np.asarray(distance, float), count).copy(),
-        rng.uniform(0.2, 1, count),
-        2 * np.pi * rng.random(count),
-        aperture,
-    )
 
 
 def field_of(clouds, settings):
