@@ -162,7 +162,7 @@ def require(*programs: str) -> None:
 def _start(command: Sequence[str], log: Path) -> XServer:
     """Return a server that answers, on a display number that it found free itself."""
     read, write = os.pipe()
-    with open(read, "rb") as answer, log.with_suffix(".out").open("wb") as out:
+    with os.fdopen(read, "rb") as answer, log.with_suffix(".out").open("wb") as out:
         process = subprocess.Popen(
             [*command, "-nolisten", "tcp", "-displayfd", str(write)], pass_fds=[write], stdout=out, stderr=out
         )
