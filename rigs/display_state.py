@@ -16,7 +16,7 @@ from rigs.hdmi.edid import Edid
 from rigs.hdmi.x_outputs import Output, Saver
 
 RAMP_LIMIT = 0.5  # of 255: below it every level is itself again when rounded to 8 bits; a gamma of 1.01 is 0.93 off
-FULL_ENTRIES = (65535, 65280)  # the last entry of a straight ramp, 257 i or 256 i: drivers write either
+STRAIGHT_ENDS = (65280, 65535)  # of a ramp with the entries 256 i or 257 i: drivers write either
 UPRIGHT = 1  # RandR's Rotate_0
 ROTATIONS = {1: "normal", 2: "left", 4: "inverted", 8: "right"}
 
@@ -84,7 +84,8 @@ def ramp_error(ramp: NDArray[np.uint16]) -> float:
     entries = ramp.shape[1]
     if entries < 2:
         return float("nan")
-    return min(float(np.abs(ramp - np.linspace(0.0, full, entries)).max()) * 255.0 / full for full in FULL_ENTRIES)
+    full = next((entry for entry in STRAIGHT_ENDS if ramp[:, -1].max() <= entry), 65535)
+    return float(np.abs(ramp - np.linspace(0.0, full, entries)).max()) * 255.0 / full
 
 
 def _native(output: Output) -> bool | None:

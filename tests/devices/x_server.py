@@ -64,11 +64,13 @@ class XServer:
     display: str
     process: subprocess.Popen[bytes]
 
+    def environment(self) -> dict[str, str]:
+        """Return the environment of a client of this server."""
+        return os.environ | {"DISPLAY": self.display}
+
     def run(self, *command: str) -> str:
         """Return what an X client prints."""
-        done = subprocess.run(
-            command, env=os.environ | {"DISPLAY": self.display}, capture_output=True, text=True, timeout=30
-        )
+        done = subprocess.run(command, env=self.environment(), capture_output=True, text=True, timeout=30)
         if done.returncode:
             raise RuntimeError(f"{' '.join(command)} ended with {done.returncode}: {done.stderr.strip()}")
         return done.stdout
