@@ -57,7 +57,10 @@ PACKINGS = {"red": np.uint32(0x010000), "grey": np.uint32(0x010101)}
 
 
 class HdmiTable(Table):
-    """``[slm]`` with ``driver = "hdmi"``. Empty `vendor`, `model` and `serial` are taken from the monitor's EDID."""
+    """``[slm]`` with ``driver = "hdmi"``.
+
+    `vendor`, `model` and `serial` stand for what the monitor does not say by its EDID, and are held against what it says.
+    """
 
     driver: Literal["hdmi"] = "hdmi"
     monitor: str = Field(min_length=1)
@@ -122,10 +125,14 @@ class HdmiSlm:
             table.height,
             table.pitch_um * UM,
             table.bits,
-            table.vendor or edid.vendor,
-            table.model or edid.model,
-            table.serial or edid.serial,
+            edid.vendor or table.vendor,
+            edid.model or table.model,
+            edid.serial or table.serial,
         )
+
+    def identity(self) -> dict[str, str]:
+        """Return what a calibration hangs on beyond the facts: how a level is put into a pixel."""
+        return {"packing": self._table.packing}
 
     def show(self, levels: NDArray[np.uint8]) -> Shown:
         """Show (height, width) levels; returns when they were read back and have settled."""

@@ -288,7 +288,7 @@ def test_the_monitors_identity_and_colour_range_are_read_from_its_output(x_serve
             display.xrandr_delete_output_property(output, atom)
         display.sync()
         display.close()
-    assert (facts.vendor, facts.model, facts.serial) == ("HOL", "PLUTO-2", "6010-0417")
+    assert (facts.vendor, facts.model, facts.serial) == ("HOL", "LETO-3", "6010-0417")
     swapped = found["panel output: monitor"]
     assert (swapped.ok, swapped.measured, swapped.limit) == (False, "LETO-3", "PLUTO-2")
     assert found["panel output: Broadcast RGB"].ok is False
