@@ -59,7 +59,8 @@ PACKINGS = {"red": np.uint32(0x010000), "grey": np.uint32(0x010101)}
 class HdmiTable(Table):
     """``[slm]`` with ``driver = "hdmi"``.
 
-    `vendor`, `model` and `serial` stand for what the monitor does not say by its EDID, and are held against what it says.
+    `vendor`, `model` and `serial` stand in for what the monitor's EDID does not say; `inspect` holds them
+    against what it says.
     """
 
     driver: Literal["hdmi"] = "hdmi"
