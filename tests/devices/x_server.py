@@ -64,11 +64,13 @@ class XServer:
     display: str
     process: subprocess.Popen[bytes]
 
+    def environment(self) -> dict[str, str]:
+        """Return the environment of a client of this server."""
+        return os.environ | {"DISPLAY": self.display}
+
     def run(self, *command: str) -> str:
         """Return what an X client prints."""
-        done = subprocess.run(
-            command, env=os.environ | {"DISPLAY": self.display}, capture_output=True, text=True, timeout=30
-        )
+        done = subprocess.run(command, env=self.environment(), capture_output=True, text=True, timeout=30)
         if done.returncode:
             raise RuntimeError(f"{' '.join(command)} ended with {done.returncode}: {done.stderr.strip()}")
         return done.stdout
@@ -162,7 +164,7 @@ def require(*programs: str) -> None:
 def _start(command: Sequence[str], log: Path) -> XServer:
     """Return a server that answers, on a display number that it found free itself."""
     read, write = os.pipe()
-    with open(read, "rb") as answer, log.with_suffix(".out").open("wb") as out:
+    with os.fdopen(read, "rb") as answer, log.with_suffix(".out").open("wb") as out:
         process = subprocess.Popen(
             [*command, "-nolisten", "tcp", "-displayfd", str(write)], pass_fds=[write], stdout=out, stderr=out
         )
