@@ -10,6 +10,7 @@ from __future__ import annotations
 import ctypes
 import logging
 import os
+import socket
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -29,6 +30,7 @@ AUTO_EXPOSURE_US = 2500  # what its own automatic exposure chooses: wrong, as a 
 GAMMA = 2.2
 TEMPERATURE_CENTI_C = 4250
 TRIGGERS_HZ = 1000.0  # how often it looks for one; its own 25 would be most of a small frame's time
+CONTROL_PORT = 3956  # of GigE Vision
 BROKEN = 70  # exit status of a bench that could not make a picture
 
 # (exposure in whole microseconds, bits) -> counts of the whole sensor, (height, width)
@@ -68,7 +70,9 @@ class GigeServer:
         as_delivered: bool = True,
     ) -> None:
         self.frames = 0
+        self._server: Any = None
         self._render, self._library = render, _library()
+        _require_free_port(address)
         handle, name = tempfile.mkstemp(suffix=".xml", prefix="holocal-bench-")
         self._description = Path(name)
         with os.fdopen(handle, "w") as file:
@@ -77,11 +81,10 @@ class GigeServer:
         self._server = self._library.arv_gv_fake_camera_new(address.encode(), serial.encode())
         if not self._server or not self._library.arv_gv_fake_camera_is_running(self._server):
             self.close()
-            raise BusyError(
-                f"no GigE Vision camera can be served on {address}: its control port, UDP 3956, is taken.",
-                why="The standard allows one camera per address.",
-                fix="End the other bench on this host.",
-                code="camera-port",
+            raise ConfigError(
+                f"no GigE Vision camera can be served on {address}.",
+                fix="Give the address of a network card of this host.",
+                code="camera-address",
             )
         self._camera = self._library.arv_gv_fake_camera_get_fake_camera(self._server)
         for register, value in (
@@ -152,6 +155,20 @@ class GigeServer:
 
 
 _AUTOMATIC = (registers.EXPOSURE_AUTO, registers.GAIN_AUTO, registers.GAMMA_ENABLE)
+
+
+def _require_free_port(address: str) -> None:
+    """Raise `BusyError` when another camera is served there: libaravis would share the port and answer at random."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.bind((address, CONTROL_PORT))
+        except OSError as error:
+            raise BusyError(
+                f"no GigE Vision camera can be served on {address}: UDP {CONTROL_PORT}, its control port: {error}.",
+                why="The standard allows one camera per address.",
+                fix="End the other bench on this host.",
+                code="camera-port",
+            ) from error
 
 
 def _library() -> Any:
