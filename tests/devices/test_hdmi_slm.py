@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import json
+import os
 import signal
 import subprocess
 import sys
@@ -221,6 +223,24 @@ def test_no_cursor_is_drawn_on_the_panel(x_server: XServer) -> None:
     display.close()
 
 
+def test_no_screen_saver_comes_while_the_panel_is_open(x_server: XServer) -> None:
+    display = x_display.Display()
+    root = display.screen().root
+
+    def saver_comes() -> bool:
+        x_server.run("xset", "s", "1", "s", "reset")
+        time.sleep(2.2)  # it is asked for after 1 s without input
+        return bool(root.screensaver_query_info().state)
+
+    assert saver_comes()
+    with panel() as slm:
+        assert not saver_comes()
+        (found,) = (finding for finding in slm.inspect() if "screen saver" in finding.title)
+        assert (found.ok, found.measured) == (True, "after 1 s, held off")
+    x_server.run("xset", "s", "600", "s", "reset")
+    display.close()
+
+
 def test_a_mode_that_changes_under_the_window_is_an_error(x_server: XServer) -> None:
     x_server.set_panel(800, 600)
     x_server.set_panel(960, 540)
@@ -406,10 +426,56 @@ def test_a_server_lost_before_blank_or_close_stops_neither(tmp_path: Path) -> No
     assert (closing.returncode, blanking.returncode) == (0, 0)
 
 
-def start(code: str, server: XServer) -> Any:
+def test_a_run_whose_display_ends_stops_resumable_with_the_light_off(tmp_path: Path) -> None:
+    code = """
+import os
+from pathlib import Path
+from lab_bench.levelling import Levelling, Parameters
+from lab_bench.rig import LabRig
+from holocal.loop.record import RunRecord
+from holocal.loop.runner import run
+from holocal.records.rig import load_rig
+from rigs.hdmi_slm import HdmiSlm
+
+class Both(HdmiSlm):  # the lab's camera looks at the levels of its own panel
+    def show(self, levels):
+        rig.eye.show(levels)
+        return super().show(levels)
+
+class Watcher:
+    def preflight(self, checks, seconds): ...
+    def waiting(self, what): ...
+    def incident(self, sentence): ...
+    def step(self, number, progress, judgement):
+        print("step", number, flush=True)
+        sys.stdin.readline()
+
+rig = LabRig(load_rig("lab-bench", ["slm.width=960", "slm.height=540"]))
+rig.eye, slm.__class__, rig.slm = rig.slm, Both, slm
+record = RunRecord.create(Path(sys.argv[1]), "levelling", config="", identity={})
+with record.open():
+    try:
+        run(Levelling(), rig, Parameters(), seed=1, record=record, calibration={}, observer=Watcher())
+    except DeviceError as error:
+        print(error.exit_status, error.code, "light", rig.light.lit, flush=True)
+slm.close()
+"""
+    with xorg(tmp_path) as server:
+        child = start(code, server, str(tmp_path))
+        assert child.stdout.readline() == "step 1\n"
+        server.kill()
+        said, trouble = child.communicate("\n", timeout=60)
+    assert said == "6 display-lost light False\n", trouble
+    assert child.returncode == 0, trouble
+    (run,) = tmp_path.glob("*-levelling-*")
+    assert json.loads((run / "manifest.json").read_text())["status"] == "interrupted"
+
+
+def start(code: str, server: XServer, *arguments: str) -> Any:
+    paths = [str(Path(__file__).parents[1] / "lab"), str(Path(__file__).parents[2])]
     return subprocess.Popen(
-        [sys.executable, "-c", CHILD + code],
-        env=server.environment(),
+        [sys.executable, "-c", CHILD + code, *arguments],
+        env=server.environment() | {"PYTHONPATH": os.pathsep.join(paths)},
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
