@@ -416,7 +416,9 @@ def test_a_server_lost_before_blank_or_close_stops_neither(tmp_path: Path) -> No
         code = (
             'print("up", flush=True)\nsys.stdin.readline()\nattempt("blank", slm.blank)\nattempt("close", slm.close)\n'
         )
-        closing = start('print("up", flush=True)\nsys.stdin.readline()\nattempt("close", slm.close)\n', server)
+        bare = "from rigs.hdmi.window import PanelWindow\nwindow = PanelWindow(slm._place)\n"
+        last = 'print("up", flush=True)\nsys.stdin.readline()\nattempt("close", window.close)\n'
+        closing = start(bare + last, server)
         assert closing.stdout.readline() == "up\n"
         blanking = start(code, server)
         assert blanking.stdout.readline() == "up\n"
@@ -471,9 +473,22 @@ slm.close()
     assert json.loads((run / "manifest.json").read_text())["status"] == "interrupted"
 
 
+_children: list[subprocess.Popen[str]] = []
+
+
+@pytest.fixture(autouse=True)
+def no_child_is_left() -> Iterator[None]:
+    yield
+    for child in _children:
+        if child.poll() is None:
+            child.kill()
+        child.wait()
+    _children.clear()
+
+
 def start(code: str, server: XServer, *arguments: str) -> Any:
     paths = [str(Path(__file__).parents[1] / "lab"), str(Path(__file__).parents[2])]
-    return subprocess.Popen(
+    child = subprocess.Popen(
         [sys.executable, "-c", CHILD + code, *arguments],
         env=server.environment() | {"PYTHONPATH": os.pathsep.join(paths)},
         stdin=subprocess.PIPE,
@@ -481,3 +496,5 @@ def start(code: str, server: XServer, *arguments: str) -> Any:
         stderr=subprocess.PIPE,
         text=True,
     )
+    _children.append(child)
+    return child
