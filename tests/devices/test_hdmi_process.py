@@ -1,4 +1,4 @@
-"""The panel's window in a process of its own: signals reach Python, and a display that ends does not end the process."""
+"""The panel in a process of its own: signals reach Python, and a display that ends does not end the process."""
 
 from __future__ import annotations
 
