@@ -35,7 +35,10 @@ class Reader:
             self._mss = mss.MSS(with_cursor=False) if sys.platform.startswith("linux") else mss.MSS()
         except ScreenShotError as error:
             raise DeviceError(
-                f"the screen cannot be read back: {error}.", fix='Set verify = "never" in [slm].', code="no-read-back"
+                f"the screen cannot be read back: {error}.",
+                why="Whether the panel shows its pattern would not be known.",
+                fix='Install what is missing, or set verify = "never" in [slm].',
+                code="no-read-back",
             ) from error
 
     def pixels(self) -> NDArray[np.uint32]:

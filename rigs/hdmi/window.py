@@ -131,7 +131,7 @@ class PanelWindow:
         self._sdl = sdl = start_sdl()
         self.driver = sdl.SDL_GetCurrentVideoDriver().decode()
         self._connection = x_guard.Connection()
-        self._display = 0
+        self._display, self._closed = 0, False
         flags = sdl.SDL_WINDOW_FULLSCREEN_DESKTOP | sdl.SDL_WINDOW_BORDERLESS | sdl.SDL_WINDOW_ALWAYS_ON_TOP
         self._window = sdl.SDL_CreateWindow(TITLE, place.x, place.y, place.width, place.height, flags)
         try:
@@ -187,15 +187,16 @@ class PanelWindow:
 
     def close(self) -> None:
         """Close the window; safe to call twice, and after the display server is lost."""
-        if not self._window:
+        if self._closed:
             return
         self._require_thread()
-        if not self._connection.lost:
+        if self._window and not self._connection.lost:
             self._pump()  # finds out whether the server is still there: SDL would wait for its answer for ever
-        window, self._window = self._window, None
+        window, self._window, self._closed = self._window, None, True
         if self._connection.lost:
             return
-        self._sdl.SDL_DestroyWindow(window)
+        if window:
+            self._sdl.SDL_DestroyWindow(window)
         self._sdl.SDL_QuitSubSystem(self._sdl.SDL_INIT_VIDEO)
         if not self._sdl.SDL_WasInit(self._sdl.SDL_INIT_VIDEO):
             x_guard.forget(self._display)

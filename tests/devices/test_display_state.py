@@ -100,6 +100,8 @@ def test_both_usual_ways_of_writing_a_straight_ramp_pass_and_a_gamma_of_1_percen
     bent = RAMP.copy()
     bent[1] = np.round(65535 * np.linspace(0, 1, 256) ** (1 / 1.01))
     assert ramp_error(bent) == pytest.approx(255 * 0.01 / np.e, rel=0.02)  # u ln u is -1/e at most; next order 1 %
+    assert verdicts(replace(GOOD, ramp=shifted))["gamma ramp: distance from a straight one"] is True
+    assert verdicts(replace(GOOD, ramp=bent))["gamma ramp: distance from a straight one"] is False
 
 
 def test_an_edid_says_who_made_the_monitor() -> None:

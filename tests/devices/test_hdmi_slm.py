@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-import signal
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import mss
@@ -18,7 +14,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from test_display_state import edid_bytes
-from x_server import XServer, xorg
+from x_server import XServer
 from Xlib import X, Xatom, Xcursorfont
 from Xlib import display as x_display
 
@@ -221,6 +217,24 @@ def test_no_cursor_is_drawn_on_the_panel(x_server: XServer) -> None:
     display.close()
 
 
+def test_no_screen_saver_comes_while_the_panel_is_open(x_server: XServer) -> None:
+    display = x_display.Display()
+    root = display.screen().root
+
+    def saver_comes() -> bool:
+        x_server.run("xset", "s", "1", "s", "reset")
+        time.sleep(2.2)  # it is asked for after 1 s without input
+        return bool(root.screensaver_query_info().state)
+
+    assert saver_comes()
+    with panel() as slm:
+        assert not saver_comes()
+        (found,) = (finding for finding in slm.inspect() if "screen saver" in finding.title)
+        assert (found.ok, found.measured) == (True, "after 1 s, held off")
+    x_server.run("xset", "s", "600", "s", "reset")
+    display.close()
+
+
 def test_a_mode_that_changes_under_the_window_is_an_error(x_server: XServer) -> None:
     x_server.set_panel(800, 600)
     x_server.set_panel(960, 540)
@@ -310,108 +324,3 @@ def test_a_display_that_is_not_there_is_no_crash(monkeypatch: pytest.MonkeyPatch
     with pytest.raises(ConfigError, match="DISPLAY"):
         open_slm(PANEL, CONTEXT)
     assert discover() == ()
-
-
-CHILD = """
-import signal, sys
-import numpy as np
-from holocal.errors import DeviceError
-from rigs.context import DriverContext
-from rigs.hdmi_slm import open_slm
-
-def attempt(name, call):
-    try:
-        print(name, "returned", type(call()).__name__, flush=True)
-    except DeviceError as error:
-        print(name, "raised", error.exit_status, error.code, flush=True)
-
-panel = {"monitor": "DUMMY1", "width": 960, "height": 540, "pitch_um": 8.0, "settle_ms": 0.0}
-slm = open_slm(panel, DriverContext("bench-a", "bench-a.toml", ()))
-levels = np.random.default_rng(0).integers(0, 256, (540, 960), np.uint8)
-"""
-
-
-def test_sigterm_and_sigint_reach_python_while_the_window_is_up(x_server: XServer) -> None:
-    code = """
-def stop(number, frame):
-    slm.close()
-    print("python got", signal.Signals(number).name, flush=True)
-    raise SystemExit(7)
-
-slm.show(levels)
-for number in (signal.SIGTERM, signal.SIGINT):
-    signal.signal(number, stop)
-print("up", flush=True)
-while True:
-    slm.show(levels)
-"""
-    for number in (signal.SIGTERM, signal.SIGINT):
-        child = start(code, x_server)
-        assert child.stdout.readline() == "up\n"
-        child.send_signal(number)
-        said, trouble = child.communicate(timeout=30)
-        assert (said, child.returncode) == (f"python got {number.name}\n", 7), trouble
-
-
-def test_sigterm_without_a_handler_ends_the_process_as_ever(x_server: XServer) -> None:
-    child = start('slm.show(levels)\nprint("up", flush=True)\nwhile True: slm.show(levels)\n', x_server)
-    assert child.stdout.readline() == "up\n"
-    child.terminate()
-    child.communicate(timeout=30)
-    assert child.returncode == -signal.SIGTERM  # SDL would have swallowed it
-
-
-def test_a_lost_x_server_is_a_device_error_and_the_process_lives(tmp_path: Path) -> None:
-    code = """
-slm.show(levels)
-print("up", flush=True)
-sys.stdin.readline()
-attempt("show", lambda: slm.show(levels))
-attempt("show", lambda: slm.show(levels))
-attempt("inspect", slm.inspect)
-attempt("blank", slm.blank)
-attempt("close", slm.close)
-attempt("close", slm.close)
-attempt("open", lambda: open_slm(panel, DriverContext("bench-a", "bench-a.toml", ())))
-"""
-    with xorg(tmp_path) as server:
-        child = start(code, server)
-        assert child.stdout.readline() == "up\n"
-        server.kill()
-        said, trouble = child.communicate("\n", timeout=60)
-    assert said.splitlines() == [
-        "show raised 6 display-lost",
-        "show raised 6 display-lost",
-        "inspect raised 6 display-lost",
-        "blank returned NoneType",
-        "close returned NoneType",
-        "close returned NoneType",
-        "open raised 6 display-lost",
-    ], trouble
-    assert child.returncode == 0, trouble
-
-
-def test_a_server_lost_before_blank_or_close_stops_neither(tmp_path: Path) -> None:
-    with xorg(tmp_path) as server:
-        code = (
-            'print("up", flush=True)\nsys.stdin.readline()\nattempt("blank", slm.blank)\nattempt("close", slm.close)\n'
-        )
-        closing = start('print("up", flush=True)\nsys.stdin.readline()\nattempt("close", slm.close)\n', server)
-        assert closing.stdout.readline() == "up\n"
-        blanking = start(code, server)
-        assert blanking.stdout.readline() == "up\n"
-        server.kill()
-        assert closing.communicate("\n", timeout=60)[0] == "close returned NoneType\n"
-        assert blanking.communicate("\n", timeout=60)[0] == "blank returned NoneType\nclose returned NoneType\n"
-    assert (closing.returncode, blanking.returncode) == (0, 0)
-
-
-def start(code: str, server: XServer) -> Any:
-    return subprocess.Popen(
-        [sys.executable, "-c", CHILD + code],
-        env=server.environment(),
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )

@@ -16,8 +16,10 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+# What these tests run on: the servers, xrandr and xset, and the libraries that SDL2 and mss load when they start.
 APT_LINE = (
-    "apt-get install -y xserver-xorg-core xserver-xorg-video-dummy xvfb x11-xserver-utils"  # what these tests run on
+    "apt-get install -y xserver-xorg-core xserver-xorg-video-dummy xvfb x11-xserver-utils "
+    "libxss1 libxcb-randr0 libxcb-render0 libxcb-shm0 libxcb-xfixes0"
 )
 OPERATOR = (1920, 1080)  # DUMMY0's mode
 REFRESH_HZ = 60
