@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import logging
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
 
 LOGGER = logging.getLogger("holocal.rigs")
 DISCOVERY_MS = 500  # a camera answers a discovery broadcast within 250 ms unless it was just plugged in
+FORGOTTEN_S = 4.0  # a camera lets go of a program that is silent for its heartbeat's 3 s: `resume` after a kill waits
+RETRY_S = 0.2
 DISCOVERIES = 3  # a broadcast may be lost
 # Bootstrap registers of GigE Vision 2.2, section 28: control channel privilege, serial number, user-defined name.
 CONTROL_PRIVILEGE, SERIAL_NUMBER, USER_NAME = 0x0A00, 0x00D8, 0x00E8
@@ -109,25 +112,37 @@ def find(table: GenicamTable, source: str) -> SeenCamera:
 
 
 def connect(camera: SeenCamera, interface: str | None = None) -> viva_genicam.Camera:
-    """Return a camera under our control, which nobody else can then have; `BusyError` when somebody has it."""
+    """Return a camera under our control, which nobody else can then have.
+
+    Raises
+    ------
+    BusyError
+        Another program has it, and for longer than a camera takes to forget a program that was killed.
+    DeviceError
+        It does not answer.
+    """
     vg = viva()
-    try:
-        if camera.transport == "usb3":
-            return vg.connect_u3v(camera.handle)  # type: ignore[no-any-return]
-        return vg.connect_gige(camera.handle, iface=interface)  # type: ignore[no-any-return]
-    except vg.GenicamError as error:
-        if _in_use(camera, interface, str(error)):
-            raise BusyError(
-                f"the camera {camera} is under another program's control ({error}).",
-                why="Two programs on one camera disturb each other's measurements.",
-                fix="Close the other program, a viewer for example; a crashed one is forgotten after some seconds.",
-                code="camera-busy",
-            ) from error
-        raise DeviceError(
-            f"the camera {camera} cannot be opened: {error}.",
-            fix="Check its cable, power and network address; `holocal doctor`.",
-            code="camera-lost",
-        ) from error
+    deadline = time.monotonic() + FORGOTTEN_S
+    while True:
+        try:
+            if camera.transport == "usb3":
+                return vg.connect_u3v(camera.handle)  # type: ignore[no-any-return]
+            return vg.connect_gige(camera.handle, iface=interface)  # type: ignore[no-any-return]
+        except vg.GenicamError as error:
+            if not _in_use(camera, interface, str(error)):
+                raise DeviceError(
+                    f"the camera {camera} cannot be opened: {error}.",
+                    fix="Check its cable, power and network address; `holocal doctor`.",
+                    code="camera-lost",
+                ) from error
+            if time.monotonic() > deadline:
+                raise BusyError(
+                    f"the camera {camera} is under another program's control ({error}).",
+                    why="Two programs on one camera disturb each other's measurements.",
+                    fix="Close the other program, a viewer for example.",
+                    code="camera-busy",
+                ) from error
+        time.sleep(RETRY_S)
 
 
 def text_of(camera: viva_genicam.Camera, node: str, register: int = 0) -> str:

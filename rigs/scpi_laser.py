@@ -165,7 +165,10 @@ class ScpiLaser:
 
     def close(self) -> None:
         """Let the port go."""
+        socket = getattr(self._port, "_socket", None)
         self._port.close()
+        if socket is not None:
+            socket.close()  # pyserial 3.5 leaves it open when the other end is gone
 
     def _require_wavelength(self) -> None:
         answer = self._ask_if_known("SYSTem:INFormation:WAVelength?")

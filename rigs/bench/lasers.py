@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import socket
 import socketserver
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from types import TracebackType
 
@@ -79,6 +81,7 @@ class LaserServer:
             server.shutdown()
             thread.join()
             server.server_close()
+            server.hang_up()
         self._servers, self._threads = [], []
 
     def __enter__(self) -> LaserServer:
@@ -97,13 +100,21 @@ class _Server(socketserver.ThreadingTCPServer):
 
     def __init__(self, laser: Laser, address: tuple[str, int]) -> None:
         self.laser = laser
+        self.calls: list[socket.socket] = []
         super().__init__(address, _Handler)
+
+    def hang_up(self) -> None:
+        """End the connections that are open."""
+        for call in self.calls:
+            with suppress(OSError):  # it has ended already
+                call.shutdown(socket.SHUT_RDWR)
 
 
 class _Handler(socketserver.StreamRequestHandler):
     server: _Server
 
     def handle(self) -> None:
+        self.server.calls.append(self.request)
         try:
             for line in self.rfile:
                 self.wfile.write(self.server.laser.answer(line.decode(errors="replace")).encode())

@@ -136,6 +136,15 @@ def test_a_laser_that_is_lost_is_a_device_error_and_the_others_are_still_switche
     assert not server.lasers[1].on and caught.value.exit_status == 6
 
 
+def test_a_socket_is_closed_though_the_laser_at_its_other_end_is_gone(server, light):
+    server.close()
+    sockets = [laser._port._socket for laser in light.lasers]
+    with pytest.raises(DeviceError):
+        light.off()
+    light.close()
+    assert [socket.fileno() for socket in sockets] == [-1] * 3
+
+
 @pytest.mark.parametrize(
     ("lines", "said"),
     [

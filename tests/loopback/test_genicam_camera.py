@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
@@ -20,6 +22,15 @@ pytestmark = pytest.mark.loopback
 CONTEXT = DriverContext("bench-a", "bench-a.toml", (515e-9,))
 SENSOR = (320, 240)
 TABLE = {"driver": "genicam", "width": 320, "height": 240, "field_deg": 25.0, "pixel_format": "Mono12"}
+
+HOLDER = f"""
+import time
+from rigs.context import DriverContext
+from rigs.genicam_camera import open_camera
+camera = open_camera({TABLE!r}, DriverContext("bench-a", "bench-a.toml", ()))
+print("held", flush=True)
+time.sleep(60)
+"""
 
 
 @dataclass
@@ -139,6 +150,17 @@ def test_a_camera_in_use_is_busy_for_others_and_listed_all_the_same(server):
     camera.grab()  # the one who has it is not disturbed
     camera.close()
     opened().close()  # and gives it back at once
+
+
+def test_a_camera_whose_program_was_killed_is_had_again_at_once(server):
+    holder = subprocess.Popen([sys.executable, "-c", HOLDER], stdout=subprocess.PIPE)
+    with holder:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == b"held\n"
+        holder.kill()
+    camera = opened()
+    camera.grab()
+    camera.close()
 
 
 def test_no_camera_is_a_device_error_that_says_where_was_searched():

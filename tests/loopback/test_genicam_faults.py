@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 
 import numpy as np
@@ -84,6 +85,18 @@ def test_control_that_is_taken_away_in_mid_run_ends_it():
                 time.sleep(0.05)
         camera.close()
     assert caught.value.exit_status == 6
+
+
+def test_a_camera_that_forgets_a_dead_program_after_a_while_is_waited_for():
+    with fake() as device:
+        held = opened()
+        forgetting = threading.Timer(0.8, device.revoke_control)  # as a heartbeat that ran out
+        forgetting.start()
+        camera = opened()
+        assert camera.grab().lost_packets == 0
+        forgetting.join()
+        camera.close()
+        held.close()
 
 
 def test_a_camera_that_answers_slowly_is_waited_for():
