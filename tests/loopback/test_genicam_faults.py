@@ -7,12 +7,17 @@ import time
 
 import numpy as np
 import pytest
+from lab_drivers import LabLight, LabSlm
 from viva_genicam.testing import FakeGigeCamera, FakeU3vCamera
 
 from holocal.errors import DeviceError, RefusedError
 from holocal.loop import gates
+from holocal.loop.procedure import Shot
+from holocal.loop.shooting import Shooter
+from holocal.records.facts import RigFacts
 from rigs.bench.pixel_formats import FORMATS
 from rigs.context import DriverContext
+from rigs.devices import DevicesRig
 from rigs.genicam_camera import GenicamCamera, controlled, open_camera
 from rigs.genicam_table import CameraFile, GenicamTable
 
@@ -53,6 +58,20 @@ def test_a_frame_that_lost_a_packet_says_so_and_the_next_one_is_whole(packet):
     assert damaged.counts.shape == (240, 320)
     assert not gates.lost_packets(damaged).ok and gates.lost_packets(after).ok
     assert whole.frame_id < damaged.frame_id < after.frame_id
+
+
+def test_the_loop_takes_a_damaged_frame_again_and_gives_up_after_two():
+    incidents: list[gates.Verdict] = []
+    with fake(packet_resend=False, drop_packets=[(2, LATER), (4, LATER), (5, LATER)]):
+        rig = DevicesRig(LabSlm("slm", {}), opened(), LabLight("light", {}), None)  # type: ignore[arg-type]
+        facts = RigFacts("bench-a", rig.slm.describe(), rig.camera.describe(), (515e-9,), 3e-3, 12e-3, False)
+        shooter = Shooter(rig, facts, lambda verdict, shot, frame: incidents.append(verdict))
+        shots = [Shot(f"shot {number}", np.full((9, 16), number, np.uint8), 0.01, 515e-9, 1.0) for number in range(3)]
+        assert [shooter.shoot(shot).frame_id for shot in shots[:2]] == [1, 3]
+        with pytest.raises(DeviceError, match="lost-packets"):
+            shooter.shoot(shots[2])
+        rig.camera.close()  # type: ignore[attr-defined]
+    assert [verdict.gate for verdict in incidents] == ["lost-packets"] * 3
 
 
 def test_packets_that_the_camera_sends_again_are_no_loss():
