@@ -27,6 +27,7 @@ from holocal.records.rig import RigConfig
 from holocal.records.rig_model import Table, WavelengthNm
 from holocal.records.validate import validated
 from rigs.context import DriverContext
+from rigs.mounting import MountedCamera, MountedSlm, Mounting
 
 LOGGER = logging.getLogger("holocal.rigs")
 MM, NM = 1e-3, 1e-9
@@ -39,6 +40,18 @@ class DriverTable(BaseModel):
     model_config = ConfigDict(strict=True, extra="allow", frozen=True)
 
     driver: str = Field(min_length=1)
+
+
+class PixelsTable(DriverTable):
+    """A table of a device with pixels: how they are turned, then mirrored, into the bench's frame (`Mounting`)."""
+
+    rotate_deg: Literal[0, 90, 180, 270] = 0
+    mirror: bool = False
+
+    @property
+    def mounting(self) -> Mounting:
+        """How the device stands."""
+        return Mounting(self.rotate_deg, self.mirror)
 
 
 class BenchOptics(Table):
@@ -63,8 +76,8 @@ class DevicesFile(Table):
 
     kind: Literal["devices"]
     simulated: bool = False
-    slm: DriverTable
-    camera: DriverTable
+    slm: PixelsTable
+    camera: PixelsTable
     light: DriverTable
     optics: BenchOptics
     safety: SafetyTable = SafetyTable()
@@ -160,10 +173,10 @@ def open_rig(config: RigConfig) -> DevicesRig:
         light: Light = _opened(plugins.LIGHTS, file.light, context, stack)
         stack.callback(light.off)
         light.off()
-        slm: Slm = _opened(plugins.SLMS, file.slm, context, stack)
+        slm: Slm = MountedSlm(_opened(plugins.SLMS, file.slm, context, stack), file.slm.mounting)
         stack.callback(slm.blank)
         slm.blank()
-        camera: Camera = _opened(plugins.CAMERAS, file.camera, context, stack)
+        camera: Camera = MountedCamera(_opened(plugins.CAMERAS, file.camera, context, stack), file.camera.mounting)
         _require_serial("slm", file.slm, slm.describe().serial, config.source)
         _require_serial("camera", file.camera, camera.describe().serial, config.source)
         facts = _facts(config, file, slm, light, camera)
@@ -174,7 +187,9 @@ def open_rig(config: RigConfig) -> DevicesRig:
 
 def _opened(group: str, table: DriverTable, context: DriverContext, stack: ExitStack) -> Any:
     """Return the device of a table; it is closed, if it can be, when `stack` is."""
-    device = plugins.load(group, table.driver)(table.model_dump(), context)
+    device = plugins.load(group, table.driver)(
+        table.model_dump(exclude=set(PixelsTable.model_fields) - {"driver"}), context
+    )
     close = getattr(device, "close", None)
     if close is not None:
         stack.callback(_closed, close)

@@ -81,7 +81,6 @@ class GenicamCamera:
         return {
             "pixel_format": table.pixel_format,
             "offset": [table.offset_x, table.offset_y],
-            "flip": [table.flip_x, table.flip_y],
             "gain": gain,
         }
 
@@ -205,8 +204,7 @@ class GenicamCamera:
             if not lost:
                 raise
             return blank
-        flipped = counts[:: -1 if table.flip_y else 1, :: -1 if table.flip_x else 1]
-        return np.ascontiguousarray(flipped >> table.shift_bits)
+        return np.ascontiguousarray(counts >> table.shift_bits)
 
     def _read_exposure(self) -> float:
         self._camera.invalidate(self.bounds.node)  # what the camera made of it, not what was written

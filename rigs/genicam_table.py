@@ -22,9 +22,8 @@ class GenicamTable(Table):
 
     The camera is the only one that answers, or the one that `serial`, `user_id` or `address` (IPv4, GigE Vision) names.
     `interface` is the network card that it hangs on, by address or name. The region of interest is `width` x `height`
-    pixels from `offset_x`, `offset_y` of the sensor; `field_deg` is the full angle that its width covers. `flip_x` and
-    `flip_y` turn the picture so that its columns ascend in x and its rows descend in y. `shift_bits` drops low bits of
-    a camera that sends its counts left-justified. `gain_db` is left as it is where it is not given.
+    pixels from `offset_x`, `offset_y` of the sensor; `field_deg` is the full angle that its width covers. `shift_bits` drops
+    low bits of a camera that sends its counts left-justified. `gain_db` is left as it is where it is not given.
     """
 
     driver: Literal["genicam"] = "genicam"
@@ -38,8 +37,6 @@ class GenicamTable(Table):
     offset_x: int = Field(default=0, ge=0, le=65535)
     offset_y: int = Field(default=0, ge=0, le=65535)
     field_deg: float = Field(gt=0.0, le=120.0)
-    flip_x: bool = False
-    flip_y: bool = False
     pixel_format: PixelFormat = "Mono12"
     shift_bits: int = Field(default=0, ge=0, le=8)
     gain_db: float | None = Field(default=None, ge=-100.0, le=100.0)

@@ -44,6 +44,12 @@ def _findings(device: object) -> tuple[Finding, ...]:
     return device.inspect() if isinstance(device, Inspectable) else ()
 
 
+def _identity(device: object, mounting: Mounting) -> dict[str, Any]:
+    """Return what a calibration hangs on: the device's own settings, and how it stands where that is not straight."""
+    own: dict[str, Any] = getattr(device, "identity", dict)()
+    return {**own, **({} if mounting == Mounting() else {"rotate_deg": mounting.rotate_deg, "mirror": mounting.mirror})}
+
+
 @dataclass(frozen=True)
 class MountedCamera:
     """A camera whose frames come in the bench's frame."""
@@ -70,6 +76,10 @@ class MountedCamera:
     def inspect(self) -> tuple[Finding, ...]:
         """Return what the camera says of its set-up."""
         return _findings(self.device)
+
+    def identity(self) -> dict[str, Any]:
+        """Return what a calibration hangs on beyond the facts."""
+        return _identity(self.device, self.mounting)
 
 
 @dataclass(frozen=True)
@@ -99,3 +109,7 @@ class MountedSlm:
     def inspect(self) -> tuple[Finding, ...]:
         """Return what the panel says of its set-up."""
         return _findings(self.device)
+
+    def identity(self) -> dict[str, Any]:
+        """Return what a calibration hangs on beyond the facts."""
+        return _identity(self.device, self.mounting)

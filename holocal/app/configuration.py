@@ -13,7 +13,7 @@ from holocal.records.rig import RigConfig, load_rig, parse_overrides, resolve
 from holocal.records.validate import validated
 
 SCHEMA = 1
-RIG_KEYS = ("kind", "seed", "slm", "optics", "misalignment", "camera", "illumination", "light", "safety")
+RIG_KEYS = ("kind", "seed", "simulated", "slm", "optics", "misalignment", "camera", "illumination", "light", "safety")
 
 
 @dataclass(frozen=True)

@@ -125,9 +125,21 @@ def test_the_identity_has_drivers_serials_and_settings_and_says_what_is_simulate
     pretending.close()
 
 
+def test_a_camera_that_stands_on_its_side_is_another_one_to_a_calibration_and_gives_upright_frames(tmp_path):
+    straight, turned = (open_rig(bench(tmp_path, f"camera.rotate_deg={turn}")) for turn in (0, 90))
+    facts = turned.facts().camera
+    assert (facts.width, facts.height, facts.field_rad) == (10, 20, (0.2, 0.4))
+    assert turned.camera.grab().counts.shape == (20, 10)
+    assert "camera.rotate_deg" not in identity(straight.facts())
+    assert identity(turned.facts())["camera.rotate_deg"] == 90
+    for rig in (straight, turned):
+        rig.close()
+
+
 @pytest.mark.parametrize(
     ("override", "said"),
     [
+        ("camera.rotate_deg=45", "camera.rotate_deg"),
         ("camera.driver=labb", "camera driver 'labb' is not known. Did you mean lab?"),
         ("camera.driver=lab-unfinished", "lab-drivers cannot be loaded"),
         ("slm.driver=3", "--set slm.driver"),

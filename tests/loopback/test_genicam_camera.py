@@ -95,12 +95,11 @@ def test_full_scale_is_that_of_the_pixel_format_and_the_rest_is_the_cameras_own_
     assert np.tan(facts.field_rad[1] / 2) == pytest.approx(np.tan(facts.field_rad[0] / 2) * 240 / 320)
 
 
-def test_a_region_of_the_sensor_is_that_region_and_flips_turn_it_over(server, scene):
-    for flip_x, flip_y in ((False, False), (True, False), (False, True)):
-        camera = opened(width=96, height=64, offset_x=21, offset_y=9, flip_x=flip_x, flip_y=flip_y)
-        counts = camera.grab().counts
-        camera.close()
-        assert np.array_equal(counts, scene.counts[9:73, 21:117][:: -1 if flip_y else 1, :: -1 if flip_x else 1])
+def test_a_region_of_the_sensor_is_that_region(server, scene):
+    camera = opened(width=96, height=64, offset_x=21, offset_y=9)
+    counts = camera.grab().counts
+    camera.close()
+    assert np.array_equal(counts, scene.counts[9:73, 21:117])
 
 
 def test_what_a_maker_leaves_switched_on_is_switched_off(server, scene):
