@@ -13,7 +13,9 @@ from holocal.records.rig import RigConfig, load_rig, parse_overrides, resolve
 from holocal.records.validate import validated
 
 SCHEMA = 1
-RIG_KEYS = ("kind", "seed", "simulated", "slm", "optics", "misalignment", "camera", "illumination", "light", "safety")
+RIG_KEYS = (
+    "kind", "seed", "simulated", "slm", "optics", "misalignment", "camera", "illumination", "light", "safety", "faults",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -95,6 +97,16 @@ def stored_rig(config: Mapping[str, Any]) -> RigConfig:
         key.removeprefix(prefix): value for key, value in config.get("origins", {}).items() if key.startswith(prefix)
     }
     return resolve(rig["name"], rig["source"], rig["tables"], origins, device=config.get("device", "cpu"))
+
+
+def without_faults(rig: RigConfig) -> tuple[RigConfig, dict[str, object]]:
+    """Return a simulated rig without its faults, and those that were active: a resumed run's drill is over."""
+    ended = {} if rig.model is None else rig.model.faults.active()
+    if not ended:
+        return rig, {}
+    tables = {key: value for key, value in rig.tables.items() if key != "faults"}
+    origins = {key: value for key, value in rig.origins.items() if not key.startswith("faults.")}
+    return resolve(rig.name, rig.source, tables, origins, device=rig.device), ended
 
 
 def stored_parameters(model: type[BaseModel], config: Mapping[str, Any]) -> BaseModel:

@@ -42,7 +42,10 @@ class Shot:
     """One frame that a procedure wants.
 
     `levels` None means a dark frame: light off. `measure` False marks a shot that only sets the exposure.
-    `clip_limit` is the share of pixels that may be at full scale before the runner halves the exposure.
+    `clip_limit` is the share of pixels that may be at full scale before the runner halves the exposure. `fresh` says
+    that the pattern gives light, and a picture that differs from the former pattern's by more than noise, so that a
+    panel that kept its pattern, or a light that went out, is noticed; set it False for steps too small to be seen in
+    one frame, and for patterns that send no light into the picture.
     """
 
     label: str
@@ -51,17 +54,23 @@ class Shot:
     wavelength_m: float
     clip_limit: float = 1e-4
     keep: bool = False
+    fresh: bool = True
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What a run will do, known before anything is touched (``--dry-run``)."""
+    """What a run will do, known before anything is touched (``--dry-run``).
+
+    `tolerated_drift` is the relative change of the light during the pre-flight's frames of one pattern that the target
+    still stands.
+    """
 
     frames: int
     steps: int
     expected_seconds: float
     exposure_ceiling_s: float
     sentences: tuple[str, ...] = ()
+    tolerated_drift: float = 0.02
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """The closed loop: shows, grabs, gates, journals, checkpoints, judges, verifies, stops. It knows no physics.
 
-Whatever happens, the panel is blanked and the light switched off before `run` returns or raises.
+Whatever happens, the panel is blanked and the light switched off before `run` returns or raises
+(`holocal.loop.ending`).
 """
 
 from __future__ import annotations
@@ -9,7 +10,6 @@ import logging
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -18,8 +18,11 @@ import numpy as np
 
 from holocal.errors import HolocalError, Interrupted
 from holocal.loop.devices import Frame, Repeatable, Rig
+from holocal.loop.ending import dark_at_the_end
 from holocal.loop.gates import Verdict
-from holocal.loop.preflight import Check, preflight, refuse_failed
+from holocal.loop.preflight import Check, Expectations, preflight, refuse_failed
+from holocal.loop.preflight.checks import failed
+from holocal.loop.preflight.expectations import NOTHING_EXPECTED
 from holocal.loop.procedure import Conclusion, Judgement, Outcome, Plan, Procedure, Shot
 from holocal.loop.record import RunRecord
 from holocal.loop.shooting import Shooter
@@ -77,6 +80,7 @@ def run(
     calibration: Mapping[str, Any],
     observer: Observer,
     render: Callable[[Path], bytes] | None = None,
+    expected: Expectations = NOTHING_EXPECTED,
 ) -> RunResult:
     """Return the result of one closed loop on an opened rig; goes on where `record` has a checkpoint.
 
@@ -94,6 +98,8 @@ def run(
         Who is told how it goes.
     render
         Makes the report's bytes from the run's directory; the report and the manifest are written on every end.
+    expected
+        What the pre-flight holds the rig against besides its own facts.
 
     Raises
     ------
@@ -103,7 +109,7 @@ def run(
     with stop_requests() as stop:
         try:
             with dark_at_the_end(rig):
-                done = _Loop(procedure, rig, parameters, seed, record, calibration, observer, stop).run()
+                done = _Loop(procedure, rig, parameters, seed, record, calibration, observer, stop, expected).run()
         except (Exception, KeyboardInterrupt) as error:  # every end is written down, then raised
             written = _close_failed(record, error, render)
             if written is error:
@@ -112,15 +118,6 @@ def run(
         observer.waiting("the report")
         record.finish("complete", render=render)
         return done
-
-
-@contextmanager
-def dark_at_the_end(rig: Rig) -> Iterator[None]:
-    """Blank the panel and switch the light off on every way out, each though the other may fail."""
-    with ExitStack() as stack:
-        stack.callback(rig.slm.blank)
-        stack.callback(rig.light.off)  # called first
-        yield
 
 
 def _close_failed(record: RunRecord, error: BaseException, render: Callable[[Path], bytes] | None) -> BaseException:
@@ -163,9 +160,11 @@ class _Loop:
         calibration: Mapping[str, Any],
         observer: Observer,
         stop: StopRequest,
+        expected: Expectations,
     ) -> None:
         self.procedure, self.rig, self.parameters, self.seed = procedure, rig, parameters, seed
         self.record, self.calibration, self.observer, self.stop = record, calibration, observer, stop
+        self.expected = expected
         self.facts: RigFacts = rig.facts()
         self.plan: Plan = procedure.plan(self.facts, parameters)
         self.shooter = Shooter(rig, self.facts, self._incident)
@@ -177,6 +176,8 @@ class _Loop:
 
     def run(self) -> RunResult:
         found = self.record.resume()
+        for event, values in self.record.opening:
+            self.record.journal(event, **values)
         self._preflight()
         if found is None:
             self.observer.waiting("the first pattern")
@@ -202,10 +203,14 @@ class _Loop:
         self.observer.waiting("the pre-flight")
         self._begin(PREFLIGHT_STEP)
         began = time.monotonic()
-        checks = preflight(self.shooter, self.facts, self.plan, self.record.directory)
+        checks = preflight(self.shooter, self.facts, self.plan, self.record.directory, self.expected)
         self.preflight_frames, self.shooter.frames = self.shooter.frames, 0
         self.record.preflight([item.as_json() for item in checks], frames=self.preflight_frames)
         self.observer.preflight(checks, time.monotonic() - began)
+        if refused := [item.id for item in failed(checks)]:
+            last = self.shooter.last_frame
+            name = None if last is None else self.record.keep_bad_frame(f"bad-preflight-{refused[0]}", last.counts)
+            self.record.journal("preflight", failed=refused, file=name)
         refuse_failed(checks)
 
     def _one_step(self, state: Any) -> tuple[Any, Judgement]:
