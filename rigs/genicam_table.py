@@ -22,8 +22,8 @@ class GenicamTable(Table):
 
     The camera is the only one that answers, or the one that `serial`, `user_id` or `address` (IPv4, GigE Vision) names.
     `interface` is the network card that it hangs on, by address or name. The region of interest is `width` x `height`
-    pixels from `offset_x`, `offset_y` of the sensor; `field_deg` is the full angle that its width covers. `shift_bits` drops
-    low bits of a camera that sends its counts left-justified. `gain_db` is left as it is where it is not given.
+    pixels from `offset_x`, `offset_y` of the sensor; `field_deg` is the full angle that its width covers. `shift_bits`
+    drops low bits of a camera that sends its counts left-justified. `gain_db` is left as it is where it is not given.
     """
 
     driver: Literal["genicam"] = "genicam"

@@ -111,8 +111,8 @@ def same_frames(first: list[Frame], second: list[Frame]) -> bool:
     ("faults", "exposure_s", "incidents"),
     [
         ((), 0.02, 0),
-        (("kind=frozen-once", "at=7"), 0.02, 1),
-        (("kind=lost-once", "at=7"), 0.02, 1),
+        (("kind=frozen-once", "at=15"), 0.02, 1),
+        (("kind=lost-once", "at=15"), 0.02, 1),
         ((), 0.05, 4),  # 5000 counts against a full scale of 4095: halved once in each step and the verification
     ],
 )
