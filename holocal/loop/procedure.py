@@ -42,7 +42,8 @@ class Shot:
     """One frame that a procedure wants.
 
     `levels` None means a dark frame: light off. `measure` False marks a shot that only sets the exposure.
-    `clip_limit` is the share of pixels that may be at full scale before the runner halves the exposure.
+    `clip_limit` is the share of pixels that may be at full scale before the runner halves the exposure. `fresh` False:
+    the picture need not change from the shot before.
     """
 
     label: str
@@ -51,6 +52,7 @@ class Shot:
     wavelength_m: float
     clip_limit: float = 1e-4
     keep: bool = False
+    fresh: bool = True
 
 
 @dataclass(frozen=True)
