@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from holocal.errors import SafetyStop
 from holocal.estimate.blocks import block_means
 from holocal.loop.devices import Frame
+from procedures._exposure import next_guess
 
 if TYPE_CHECKING:
     from procedures.uniformity import State
@@ -29,22 +29,9 @@ def with_exposure(state: State, frame: Frame) -> State:
     counts = frame.counts.astype(np.float64) - offset
     block = state.parameters.block_px
     brightest = float(np.quantile(block_means(counts, block).mean, 0.98))
-    clipped, faint = frame.saturated_fraction > 1e-3, brightest < 0.01 * camera.full_scale
-    if state.searched + 1 < EXPOSURE_SHOTS and (clipped or faint):
-        wanted = frame.exposure_s * (0.1 if clipped else min(30.0, 0.1 * camera.full_scale / max(brightest, 1.0)))
-        guess = float(np.clip(wanted, camera.exposure_min_s, camera.exposure_max_s))
-        if guess != frame.exposure_s:
-            return replace(state, guess_s=guess, searched=state.searched + 1)
-        if clipped:
-            raise SafetyStop(
-                f"{frame.saturated_fraction:.2%} of the pixels clip at the camera's shortest exposure, "
-                f"{1e3 * camera.exposure_min_s:g} ms.",
-                why="Clipped light is not measured, and may harm the sensor.",
-                fix="Put a neutral density filter in the beam or lower the laser's power by hand.",
-                measured=frame.saturated_fraction,
-                limit=1e-3,
-                code="too-bright",
-            )
+    guess = next_guess(frame, camera, brightest=brightest, last=state.searched + 1 >= EXPOSURE_SHOTS)
+    if guess is not None:
+        return replace(state, guess_s=guess, searched=state.searched + 1)
     lit = block_means(counts, block).mean > 0.5 * brightest
     rows, columns = (np.linspace(0, n, m + 1).round().astype(int) for n, m in zip(counts.shape, lit.shape, strict=True))
     contrasts = [

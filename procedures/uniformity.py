@@ -20,6 +20,7 @@ from holocal.estimate.registration import Registration, blob_image, register
 from holocal.loop.devices import Frame
 from holocal.loop.procedure import Conclusion, Judgement, Outcome, Plan, Shot
 from holocal.records.facts import RigFacts
+from procedures._holograms import Engine, image_levels, response_in_force
 from procedures._uniformity_exposure import with_exposure
 from procedures._uniformity_geometry import as_seen, image_region, in_image, require_registered
 
@@ -57,12 +58,13 @@ class State:
     `frames` (n, height, width) are brightness per second of exposure, dark subtracted; `shown` (n,) says with which of
     `weights` (steps, height, width; of the image) each was shown; `dark` is the dark frame in counts, `first` a white
     frame of the exposure's search that is good enough to be used. `exposure_s` 0 means that it is still being looked
-    for, from `guess_s`. `registration` maps the image to the picture; `valid`, `brightness`, `sigma` belong to the
-    picture.
+    for, from `guess_s`. `response_rad` is the phase of each level in force. `registration` maps the image to the
+    picture; `valid`, `brightness`, `sigma` belong to the picture.
     """
 
     facts: RigFacts
     parameters: Parameters
+    response_rad: Array
     seed: int
     step: int
     guess_s: float
@@ -92,22 +94,10 @@ def refine_frames(block_noise: float) -> int:
 
 def frame_levels(weights: NDArray[np.floating[Any]], state: State, step: int, shot: int) -> NDArray[np.uint8]:
     """Return the levels that show an image of these intensities with the initial phase of (seed, step, shot)."""
-    from holocal.hologram.pipeline import HologramSettings, render_image
-    from holocal.hologram.settings import Warped, Zones
-    from holocal.optics.bench import Bench, Panel
-
-    facts, chosen = state.facts, state.parameters
-    settings = HologramSettings(
-        panel=Panel(facts.slm.width, facts.slm.height, facts.slm.pitch_m),
-        bench=Bench.nominal(pupil_diameter_m=facts.pupil_diameter_m, eye_relief_m=facts.eye_relief_m),
-        wavelength_m=chosen.wavelength_nm * 1e-9,
-        fov_rad=facts.camera.field_rad,
-        method=Warped() if chosen.zones is None else Zones(chosen.zones),
-        iterations=chosen.iterations,
-        device=chosen.device,
-    )
+    chosen = state.parameters
+    engine = Engine(chosen.wavelength_nm, chosen.zones, chosen.iterations, chosen.device)
     seed = int(np.random.SeedSequence([state.seed, step, shot]).generate_state(1, np.uint64)[0])
-    return render_image(weights, settings, seed=seed).levels
+    return image_levels(weights, state.facts, engine, seed=seed, response_rad=state.response_rad)
 
 
 class Uniformity:
@@ -141,6 +131,7 @@ class Uniformity:
         return State(
             facts=facts,
             parameters=parameters,
+            response_rad=response_in_force(calibration, facts, parameters.wavelength_nm),
             seed=seed,
             step=0,
             guess_s=float(np.sqrt(facts.camera.exposure_min_s * facts.camera.exposure_max_s)),

@@ -5,7 +5,7 @@
 | uniformity | ``correction.intensity_weight`` | a point's intensity |
 | distortion | ``correction.shift_tan_x``, ``correction.shift_tan_y`` | a point's direction, added to its tangents |
 | aberration | ``correction.noll_<j>_rad`` at ``wavelength_nm`` | the points' phase functions |
-| response | ``correction.phase_rad``, 256 columns | the levels |
+| response | ``correction.phase_rad``, a column per level, at ``wavelength_nm`` | the levels, within 2 nm of that line |
 
 Maps are rectilinear over their ``extent_deg``, row 0 on top, of directions seen from the eye, not from the gaze.
 """
@@ -17,37 +17,50 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from holocal.errors import InputError
 from holocal.hologram.scenes.points import PointCloud
 from holocal.hologram.wavefront import Wavefront, field_basis
 from holocal.optics.bench import Array, Bench
 from holocal.records.calibration import Accepted
+from holocal.records.response import PHASE, RESPONSE, PhaseResponse, response_of
 from holocal.units import DEGREE, NM
 
-UNIFORMITY, DISTORTION, ABERRATION, RESPONSE = "uniformity", "distortion", "aberration", "response"
+__all__ = ["PHASE", "RESPONSE", "Corrections", "FieldMap", "corrections_of"]
+
+UNIFORMITY, DISTORTION, ABERRATION = "uniformity", "distortion", "aberration"
 WEIGHT = "correction.intensity_weight"
 SHIFTS = ("correction.shift_tan_x", "correction.shift_tan_y")
 NOLL = re.compile(r"correction\.noll_(\d+)_rad")
-PHASE = "correction.phase_rad"
 _FIELD_DEGREE = 5  # of a Zernike coefficient over the field; the residual of the fit is its own check
-_LEVELS = 256
 
 
 @dataclass(frozen=True)
 class Corrections:
     """What the accepted calibration does to a scene.
 
-    `weight` and `shift` map directions; `wavefront` and `response_rad` (256,) are for the engine; `identities` names
-    the corrections in force that change nothing and are left out.
+    `weight` and `shift` map directions; `wavefront` and `response` are for the engine; `identities` names the
+    corrections in force that change nothing and are left out.
     """
 
     weight: FieldMap | None = None
     shift: tuple[FieldMap, FieldMap] | None = None
     wavefront: Wavefront | None = None
-    response_rad: Array | None = None
+    response: PhaseResponse | None = None
     identities: tuple[str, ...] = ()
+
+    def skipped(self, wavelength_nm: float) -> list[str]:
+        """Return a sentence for each correction in force that a frame of this line goes without."""
+        said = [f"the accepted {name}: it changes nothing" for name in self.identities]
+        left_out = self.response.left_out(wavelength_nm) if self.response else ""
+        return [*said, left_out] if left_out else said
+
+    def response_rad(self, wavelength_nm: float, bits: int) -> Array | None:
+        """Return the phase of each level of a panel at a line; None stands for 2 pi L / 256."""
+        measured = self.response.at(wavelength_nm) if self.response else None
+        if measured is None and bits < 8:
+            return np.asarray(np.arange(2**bits) * (2 * np.pi / 2**bits))
+        return measured
 
     def apply(self, cloud: PointCloud, gaze_rad: tuple[float, float]) -> PointCloud:
         """Return a cloud with corrected directions and brightness; the tangents of a cloud are relative to the gaze."""
@@ -115,10 +128,9 @@ def corrections_of(accepted: Mapping[str, Accepted], *, fov_rad: tuple[float, fl
         identities += _kept_out(ABERRATION, wavefront.is_identity())
         found = replace(found, wavefront=None if ABERRATION in identities else wavefront)
     if one := accepted.get(RESPONSE):
-        phase = _response(one)
-        linear = np.arange(_LEVELS) * (2 * np.pi / _LEVELS)
-        identities += _kept_out(RESPONSE, bool(np.allclose(phase, linear, atol=1e-6)))
-        found = replace(found, response_rad=None if RESPONSE in identities else phase)
+        response = response_of(one)
+        identities += _kept_out(RESPONSE, response.is_identity())
+        found = replace(found, response=None if RESPONSE in identities else response)
     return replace(found, identities=tuple(identities))
 
 
@@ -147,13 +159,6 @@ def _wavefront(accepted: Accepted, fov_rad: tuple[float, float]) -> Wavefront:
     inverse = np.linalg.pinv(field_basis(nodes, half, _FIELD_DEGREE))
     rows = tuple(tuple(float(c) for c in inverse @ one.at(nodes)) for one in maps.values())
     return Wavefront(tuple(maps), rows, half, _FIELD_DEGREE, float(wavelength) * NM)
-
-
-def _response(accepted: Accepted) -> Array:
-    values: NDArray[np.float32] | None = accepted.maps.channels.get(PHASE)
-    if values is None or values.size != _LEVELS:
-        raise _missing(accepted, f"channel {PHASE} with {_LEVELS} values")
-    return np.asarray(values, np.float64).ravel()
 
 
 def _missing(accepted: Accepted, what: str) -> InputError:

@@ -169,7 +169,7 @@ def _line(
     points = scenes.clouds(content, settings, initial_phase=phase, pixels=asked.pixels)
     points = [corrections.apply(cloud, settings.gaze_rad) for cloud in points]
     scene_s = time.monotonic() - began
-    skipped = [f"the accepted {name}: it changes nothing" for name in corrections.identities]
+    skipped = corrections.skipped(wavelength_nm)
     if asked.colour and not any(cloud.amplitude.any() for cloud in points):
         skipped.append("the wavelength: no light in it, no frame")
         return {"wavelength_nm": wavelength_nm, "frame": None, "seconds": {"scene": scene_s}, "skipped": skipped}
@@ -178,7 +178,7 @@ def _line(
         settings,
         encoder=encoder_of(asked),
         keep_complex=outputs.hologram is not None,
-        response_rad=corrections.response_rad,
+        response_rad=corrections.response_rad(wavelength_nm, facts.slm.bits),
         store=ArrayCache(),
     )
     began_writing = time.monotonic()

@@ -6,5 +6,7 @@ thesis_map      the thesis's estimate of the brightness: block means, then a Gau
 registration    where the camera sees the image, from a frame of blobs
 brightness      the default: one smooth map from all frames, by a Gaussian process
 uniformity      non-uniformity of a picture, speckle taken out, with its error
+fringes         the phases of unknown steps, from the fringe that every camera pixel sees
+response        the phase of every level of a panel, from the phases of some
 ==============  =========================================================================
 """

@@ -59,8 +59,8 @@ def phase_to_levels(phase_rad: NDArray[np.float32], response_rad: ArrayLike | No
     phase_rad
         (rows, columns) radians.
     response_rad
-        (256,) the phase that each level really gives; default 2 pi L / 256. Distances are taken round the circle, and
-        the smallest of equally good levels is chosen.
+        (2**bits,) the phase that each level really gives, 8 bits at most; default 2 pi L / 256. Distances are taken
+        round the circle, and the smallest of equally good levels is chosen.
     """
     table = None if response_rad is None else _nearest_levels(response_rad)
     phases = np.atleast_2d(phase_rad)
@@ -77,13 +77,24 @@ def phase_to_levels(phase_rad: NDArray[np.float32], response_rad: ArrayLike | No
 
 
 def _nearest_levels(response_rad: ArrayLike) -> NDArray[np.uint8]:
-    """Return the nearest level to each of _FINE phases round the circle."""
+    """Return the nearest level to each of _FINE phases round the circle: one of its two neighbours on it."""
     response = np.asarray(response_rad, np.float64)
-    if response.shape != (LEVELS,) or not np.all(np.isfinite(response)):
-        raise InputError(f"A phase response has {LEVELS} finite entries; this one has shape {response.shape}.")
+    count = response.size
+    if response.ndim != 1 or not 2 <= count <= LEVELS or count & (count - 1) or not np.all(np.isfinite(response)):
+        raise InputError(
+            f"A phase response has a finite entry for each of 2**bits levels, {LEVELS} at most; this one has shape "
+            f"{response.shape}."
+        )
+    place, first = np.unique(np.round(np.mod(response, 2 * np.pi), 12), return_index=True)
+    around = np.concatenate([[place[-1] - 2 * np.pi], place, [place[0] + 2 * np.pi]])
+    level = np.concatenate([first[-1:], first, first[:1]])
     phase = 2 * np.pi * np.arange(_FINE) / _FINE
-    distance = np.abs(np.angle(np.exp(1j * (phase[:, None] - response[None, :]))))
-    return np.asarray(np.argmin(np.round(distance, 12), axis=1), np.uint8)
+    above = np.searchsorted(around, phase)
+    below = np.maximum(above - 1, 0)
+    far, near = around[above] - phase, phase - around[below]
+    even = np.isclose(far, near, rtol=0.0, atol=1e-12)
+    upper = np.where(even, level[above] < level[below], far < near)
+    return np.asarray(np.where(upper, level[above], level[below]), np.uint8)
 
 
 def pack_rgb(levels: NDArray[np.uint8]) -> NDArray[np.uint8]:

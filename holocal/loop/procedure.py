@@ -41,11 +41,10 @@ class Judgement:
 class Shot:
     """One frame that a procedure wants.
 
-    `levels` None means a dark frame: light off. `measure` False marks a shot that only sets the exposure.
-    `clip_limit` is the share of pixels that may be at full scale before the runner halves the exposure. `fresh` says
-    that the pattern gives light, and a picture that differs from the former pattern's by more than noise, so that a
-    panel that kept its pattern, or a light that went out, is noticed; set it False for steps too small to be seen in
-    one frame, and for patterns that send no light into the picture.
+    `levels` None means a dark frame: light off. `clip_limit` is the share of pixels that may be at full scale before
+    the runner halves the exposure. `fresh` says that the pattern gives light, and a picture that differs from the
+    former pattern's by more than noise, so that a panel that kept its pattern, or a light that went out, is noticed;
+    set it False for steps too small to be seen in one frame, and for patterns that send no light into the picture.
     """
 
     label: str

@@ -117,7 +117,7 @@ def test_zernike_maps_become_a_wavefront_over_the_field():
 def test_a_response_is_handed_to_the_levels():
     phase = np.linspace(0, 5.9, 256)[None, :]
     found = corrections_of(accepted("response", {PHASE: phase}), fov_rad=FOV)
-    np.testing.assert_allclose(found.response_rad, phase[0], atol=1e-6)
+    np.testing.assert_allclose(found.response_rad(515.0, 8), phase[0], atol=1e-6)
 
 
 def test_corrections_that_change_nothing_are_left_out_and_named():
@@ -132,7 +132,7 @@ def test_corrections_that_change_nothing_are_left_out_and_named():
     cloud, _ = points()
     assert found.apply(cloud, (0.0, 0.0)) is cloud
     assert found.wavefront is None
-    assert found.response_rad is None
+    assert found.response is None
 
 
 @pytest.mark.parametrize("procedure", ["uniformity", "distortion", "aberration", "response"])
