@@ -1,7 +1,7 @@
 """What was recorded: the frames of a run directory in the order in which they were taken, or pictures of any origin.
 
-A run that keeps every frame has in ``events.jsonl``, for every sitting, a line ``"event": "camera"`` with the camera's
-facts, and for every grab, retakes and the pre-flight included, a line::
+A run that keeps every frame (``holocal run --keep-frames``) has in ``events.jsonl``, for every sitting, a line
+``"event": "camera"`` with the camera's facts, and for every grab, retakes and the pre-flight included, a line::
 
     {"event": "grab", "step": 3, "shot": "square", "lit": true, "levels_sha256": "...", "asked_s": 0.02,
      "exposure_s": 0.02, "frame_id": 17, "lost_packets": 0, "file": "frames/grab-000017.png"}

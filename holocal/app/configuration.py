@@ -28,6 +28,7 @@ class RunConfig:
     origins: Mapping[str, str]
     seed: int
     corrections: Mapping[str, str]
+    keep_frames: bool = False
 
     def toml(self) -> str:
         """Return the run's ``config.toml``."""
@@ -38,6 +39,7 @@ class RunConfig:
             "procedure": self.procedure,
             "seed": self.seed,
             "device": self.rig.device,
+            "keep_frames": self.keep_frames,
             "rig": {"name": self.rig.name, "source": self.rig.source, "tables": dict(self.rig.tables)},
             "parameters": self.parameters.model_dump(mode="json"),
             "corrections": dict(self.corrections),

@@ -165,6 +165,7 @@ def start(
     runs: Path,
     corrections_choice: str,
     observer: Observer,
+    keep_frames: bool = False,
 ) -> RunResult:
     """Return the result of a new run."""
     procedure = plugins.procedure(procedure_name)
@@ -175,7 +176,7 @@ def start(
         rig_identity = identity(device.facts())
         in_force = corrections(corrections_choice, rig_identity)
         entries = {name: found.entry for name, found in in_force.items()}
-        config = configuration.RunConfig(procedure_name, rig, values, origins, seed, entries)
+        config = configuration.RunConfig(procedure_name, rig, values, origins, seed, entries, keep_frames)
         record = RunRecord.create(runs, procedure_name, config=config.toml(), identity=rig_identity)
         with record.open():
             return run(
@@ -188,6 +189,7 @@ def start(
                 observer=observer,
                 render=safe_report,
                 expected=expectations(rig, entries),
+                keep_frames=keep_frames,
             )
 
 
@@ -215,6 +217,7 @@ def resume(directory: Path, *, observer: Observer) -> RunResult:
             observer=observer,
             render=safe_report,
             expected=expectations(rig, {name: found.entry for name, found in in_force.items()}),
+            keep_frames=bool(config.get("keep_frames", False)),
         )
 
 

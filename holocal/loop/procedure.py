@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -160,4 +160,16 @@ class Procedure(Protocol[State]):
 
     def conclude(self, state: State, frames: tuple[Frame, ...]) -> Conclusion:
         """Return the result, "after" measured on the verification's frames only."""
+        ...
+
+
+@runtime_checkable
+class AgainstTruth(Protocol):
+    """What a procedure adds when its result can be held against a simulated rig's truth.
+
+    The runner asks once the conclusion is drawn, for ``truth`` in `result.json` alone: no estimate can depend on it.
+    """
+
+    def against_truth(self, conclusion: Conclusion, truth: Mapping[str, Any]) -> dict[str, Any]:
+        """Return how far a conclusion is from the truth, JSON-ready."""
         ...

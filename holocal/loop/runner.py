@@ -23,9 +23,9 @@ from holocal.loop.gates import Verdict
 from holocal.loop.preflight import Check, Expectations, preflight, refuse_failed
 from holocal.loop.preflight.checks import failed
 from holocal.loop.preflight.expectations import NOTHING_EXPECTED
-from holocal.loop.procedure import Conclusion, Judgement, Outcome, Plan, Procedure, Shot
+from holocal.loop.procedure import AgainstTruth, Conclusion, Judgement, Outcome, Plan, Procedure, Shot
 from holocal.loop.record import RunRecord
-from holocal.loop.shooting import Shooter
+from holocal.loop.shooting import Shooter, Taken
 from holocal.loop.signals import StopRequest, stop_requests
 from holocal.records.facts import RigFacts
 from holocal.records.files import json_ready
@@ -81,6 +81,7 @@ def run(
     observer: Observer,
     render: Callable[[Path], bytes] | None = None,
     expected: Expectations = NOTHING_EXPECTED,
+    keep_frames: bool = False,
 ) -> RunResult:
     """Return the result of one closed loop on an opened rig; goes on where `record` has a checkpoint.
 
@@ -100,6 +101,8 @@ def run(
         Makes the report's bytes from the run's directory; the report and the manifest are written on every end.
     expected
         What the pre-flight holds the rig against besides its own facts.
+    keep_frames
+        Keep every frame, retakes and the pre-flight's included, with a journal line each: the run can be replayed.
 
     Raises
     ------
@@ -109,7 +112,10 @@ def run(
     with stop_requests() as stop:
         try:
             with dark_at_the_end(rig):
-                done = _Loop(procedure, rig, parameters, seed, record, calibration, observer, stop, expected).run()
+                loop = _Loop(procedure, rig, parameters, seed, record, calibration, observer, stop, expected)
+                if keep_frames:
+                    loop.keep_frames()
+                done = loop.run()
         except (Exception, KeyboardInterrupt) as error:  # every end is written down, then raised
             written = _close_failed(record, error, render)
             if written is error:
@@ -169,13 +175,20 @@ class _Loop:
         self.plan: Plan = procedure.plan(self.facts, parameters)
         self.shooter = Shooter(rig, self.facts, self._incident)
         self.step = 0
+        self.now = PREFLIGHT_STEP  # which step's frames are being taken
         self.preflight_frames = 0
         self.shots: list[dict[str, Any]] = []
         self.seconds_before = 0.0
         self.started = time.monotonic()
 
+    def keep_frames(self) -> None:
+        """Have every frame from now on kept."""
+        self.shooter.taken = self._keep
+
     def run(self) -> RunResult:
         found = self.record.resume()
+        if self.shooter.taken is not None:
+            self.record.journal("camera", **asdict(self.facts.camera))
         for event, values in self.record.opening:
             self.record.journal(event, **values)
         self._preflight()
@@ -270,6 +283,7 @@ class _Loop:
         return tuple(frames)
 
     def _begin(self, step: int) -> None:
+        self.now = step
         self.shooter.begin_step()
         if isinstance(self.rig, Repeatable):
             self.rig.begin_step(self.seed, step)
@@ -277,6 +291,23 @@ class _Loop:
     def _stop_if_asked(self) -> None:
         if self.stop:
             raise _interrupted(str(self.stop.name), self.record)
+
+    def _keep(self, taken: Taken) -> None:
+        frame, step = taken.frame, "pre" if self.now == PREFLIGHT_STEP else f"{self.now:02d}"
+        whole = frame.counts.dtype == np.uint16 and frame.counts.size > 0  # what else comes is kept by its gate
+        self.record.journal(
+            "grab",
+            step=self.now,
+            shot=taken.shot.label,
+            lit=taken.lit,
+            levels_sha256=taken.levels_sha256,
+            wavelength_m=taken.shot.wavelength_m,
+            asked_s=taken.asked_s,
+            exposure_s=frame.exposure_s,
+            frame_id=frame.frame_id,
+            lost_packets=frame.lost_packets,
+            file=self.record.keep_frame(f"grab-{step}-{frame.frame_id:06d}", frame.counts) if whole else None,
+        )
 
     def _incident(self, verdict: Verdict, shot: Shot, frame: Frame) -> None:
         name = self.record.keep_bad_frame(f"bad-{self.step:02d}-{shot.label}-{frame.frame_id}", frame.counts)
@@ -289,7 +320,8 @@ class _Loop:
         extra = dict(conclusion.extra)
         truth = self.rig.truth()
         if truth is not None:
-            extra["truth"] = {**truth, **extra.get("truth", {})}
+            judge = self.procedure if isinstance(self.procedure, AgainstTruth) else None
+            extra["truth"] = {**truth, **(judge.against_truth(conclusion, truth) if judge else {})}
         result = {
             "schema": SCHEMA,
             "procedure": self.procedure.name,

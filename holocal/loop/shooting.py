@@ -30,6 +30,17 @@ Given = TypeVar("Given")
 Incident = Callable[[gates.Verdict, Shot, Frame], None]
 
 
+@dataclass(frozen=True)
+class Taken:
+    """A frame as the camera gave it, fit or not, and under what it was taken."""
+
+    shot: Shot
+    frame: Frame
+    asked_s: float
+    lit: bool
+    levels_sha256: str | None
+
+
 @dataclass
 class Shooter:
     """What takes a rig's frames; counts them, and remembers what is on the panel so nothing is shown twice."""
@@ -38,10 +49,12 @@ class Shooter:
     facts: RigFacts
     incident: Incident
     reference: Reference | None = None
+    taken: Callable[[Taken], None] | None = None  # told of every frame, retakes and the pre-flight's included
     frames: int = 0
     exposure_factor: float = 1.0
     _shown: str | None = None
     _wavelength_m: float | None = None
+    _asked_s: float = 0.0
     _light: bool | None = None
     _last_id: int | None = None
     _good: Frame | None = field(default=None, repr=False)
@@ -99,7 +112,7 @@ class Shooter:
         """Return one frame of `shot` as it comes, no retake: the pre-flight judges by itself."""
         self._prepare(shot)
         self._exposure(shot.exposure_s)
-        frame = self._grab()
+        frame = self._grab(shot)
         shape = gates.misshapen(frame, self.facts.camera)
         if not shape.ok:
             self.incident(shape, shot, frame)
@@ -168,6 +181,7 @@ class Shooter:
         """
         camera = self.facts.camera
         bounded = min(max(wanted_s, camera.exposure_min_s), camera.exposure_max_s)
+        self._asked_s = bounded
         used_s = guarded(lambda: self.rig.camera.set_exposure(bounded), "the camera")
         if used_s > camera.exposure_max_s * EXPOSURE_EXCESS:
             raise SafetyStop(
@@ -188,7 +202,7 @@ class Shooter:
                 self._shown = self._light = None
                 self._prepare(shot)
             last_id = self._last_id
-            frame = self._grab()
+            frame = self._grab(shot)
             failed = gates.first_failure(frame, self.facts.camera, self._surroundings(shot, frame, last_id))
             if failed is None:
                 self._keep(frame)
@@ -220,8 +234,11 @@ class Shooter:
             code=f"gate-{failed.gate}",
         )
 
-    def _grab(self) -> Frame:
+    def _grab(self, shot: Shot) -> Frame:
         frame = guarded(self.rig.camera.grab, "the camera")
+        if self.taken is not None:
+            lit = self._light is True
+            self.taken(Taken(shot, frame, self._asked_s, lit, self._shown if lit else None))
         self.frames += 1
         self._last_id = frame.frame_id
         counts = np.asarray(frame.counts)

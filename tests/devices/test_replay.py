@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from lab_bench.levelling import Levelling, Parameters
 from lab_bench.rig import LabRig
-from recording import RecordingRig
+from recording import WatchedRig
 
 from holocal.errors import ConfigError, DeviceError, HolocalError, InputError, Interrupted
 from holocal.loop.devices import Camera, Frame, Light, Slm
@@ -79,20 +79,27 @@ def loop(rig: Any, record: RunRecord, watcher: Watcher, **parameters: Any) -> Ru
     with record.open():
         try:
             return run(
-                Levelling(), rig, Parameters(**parameters), seed=1, record=record, calibration={}, observer=watcher
+                Levelling(),
+                rig,
+                Parameters(**parameters),
+                seed=1,
+                record=record,
+                calibration={},
+                observer=watcher,
+                keep_frames=isinstance(rig, WatchedRig),
             )
         except HolocalError as error:
             return error
 
 
-def recorded(tmp_path: Path, *faults: str, **parameters: Any) -> tuple[RecordingRig, Any, Watcher]:
+def recorded(tmp_path: Path, *faults: str, **parameters: Any) -> tuple[WatchedRig, Any, Watcher]:
     lab = LabRig(load_rig("lab-bench", [f"faults.{fault}" for fault in faults]))
     record = RunRecord.create(tmp_path, "levelling", config="", identity=identity(lab.facts()))
-    rig, watcher = RecordingRig(lab, record), Watcher()
+    rig, watcher = WatchedRig(lab, record), Watcher()
     return rig, loop(rig, record, watcher, **parameters), watcher
 
 
-def replayed(tmp_path: Path, rig: RecordingRig, **parameters: Any) -> tuple[ReplayRig, Any, Watcher]:
+def replayed(tmp_path: Path, rig: WatchedRig, **parameters: Any) -> tuple[ReplayRig, Any, Watcher]:
     again, watcher = ReplayRig(rig.record.directory, rig.facts()), Watcher()
     record = RunRecord.create(tmp_path, "again", config="", identity={})
     return again, loop(again, record, watcher, **parameters), watcher
@@ -134,9 +141,9 @@ def test_a_whole_run_replays_to_the_same_frames_and_the_same_result(
 def test_a_run_that_was_interrupted_and_resumed_replays_as_one(tmp_path: Path) -> None:
     lab = LabRig(load_rig("lab-bench"))
     record = RunRecord.create(tmp_path, "levelling", config="", identity=identity(lab.facts()))
-    rig = RecordingRig(lab, record)
+    rig = WatchedRig(lab, record)
     assert isinstance(loop(rig, record, Watcher(stop_at=2)), Interrupted)
-    second = RecordingRig(LabRig(load_rig("lab-bench")), RunRecord.reopen(record.directory))
+    second = WatchedRig(LabRig(load_rig("lab-bench")), RunRecord.reopen(record.directory))
     done = loop(second, second.record, Watcher())
     assert isinstance(done, RunResult)
     again, done_again, _ = replayed(tmp_path, rig)
