@@ -67,6 +67,8 @@ def make_reference(darks: Sequence[Frame], same: Sequence[Frame]) -> Reference:
     longer_s = darks[1].exposure_s - darks[0].exposure_s
     dark_rate = (float(second[usable].mean()) - offset) / longer_s if longer_s > 0 else 0.0
     read_variance = max(float(np.var((second - first)[usable])) / 2, LEAST_VARIANCE)
+    if abs(dark_rate) * longer_s < 3 * np.sqrt(2 * read_variance / max(int(usable.sum()), 1)):
+        dark_rate = 0.0  # within the error of the means: extrapolated to longer exposures it would pass for light
     plain = Reference(offset, dark_rate, read_variance, 0.0, 0.0, 0.0, noisy=True, usable=usable)
     signals = [plain.signal(frame) for frame in same]
     gain, flicker_squared = photon_transfer(signals, usable, read_variance)

@@ -8,6 +8,7 @@ exposure. The next step asks for its exposure afresh: a procedure sees from `Fra
 from __future__ import annotations
 
 import hashlib
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
@@ -22,6 +23,7 @@ from holocal.loop.procedure import Shot
 from holocal.loop.reference import Reference
 from holocal.records.facts import RigFacts
 
+LOGGER = logging.getLogger("holocal.loop")
 MOST_HALVINGS = 3
 EXPOSURE_EXCESS = 1.01  # a camera rounds up to its own step, a line's time: 0.1 % of a millisecond or so
 SHOW_AGAIN = ("unchanged", "unlit")  # gates that a pattern trips which never arrived
@@ -129,7 +131,9 @@ class Shooter:
             )
         digest = hashlib.sha256(np.ascontiguousarray(levels).data).hexdigest()
         self._shown = None
-        for _ in range(2):
+        for number in range(2):
+            if number:
+                LOGGER.warning("the SLM shows something else than it was sent: shown again")
             shown = guarded(lambda: self.rig.slm.show(levels), "the SLM")
             if shown.read_back_ok is not False and shown.sha256 == digest:
                 self._shown = digest

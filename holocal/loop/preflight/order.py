@@ -6,10 +6,18 @@ from pathlib import Path
 
 import numpy as np
 
+from holocal.loop.devices import Frame
 from holocal.loop.preflight.checks import Check, failed
 from holocal.loop.preflight.expectations import NOTHING_EXPECTED, Expectations
-from holocal.loop.preflight.panel import panel_checks
-from holocal.loop.preflight.with_light import Bench, camera_checks
+from holocal.loop.preflight.panel import (
+    change_to_blank,
+    change_to_pattern,
+    counts_of,
+    fresh_frames,
+    mean_picture,
+    panel_checks,
+)
+from holocal.loop.preflight.with_light import Bench, camera_checks, of_one_exposure, pattern_series
 from holocal.loop.preflight.without_light import (
     age_check,
     dark_checks,
@@ -20,6 +28,7 @@ from holocal.loop.preflight.without_light import (
     read_back_check,
 )
 from holocal.loop.procedure import Plan
+from holocal.loop.reference import make_reference, not_hot
 from holocal.loop.shooting import Shooter
 from holocal.records.facts import RigFacts
 
@@ -64,8 +73,25 @@ def preflight(
     if failed(checks):
         return by_number(checks)
     tolerated = TOLERATED_DRIFT if plan is None else plan.tolerated_drift
-    found, series = camera_checks(bench, darks, tolerated)
-    return by_number([*checks, *found, *panel_checks(bench, darks, series)])
+    return by_number([*checks, *_with_light(bench, darks, tolerated)])
+
+
+def _with_light(bench: Bench, darks: list[Frame], tolerated_drift: float) -> list[Check]:
+    """Return the checks with light; the shooter is told what was learnt of camera and light."""
+    usable = not_hot(darks[-1])
+    series = pattern_series(bench, float(np.median(darks[-1].counts)))
+    same = of_one_exposure(series)
+    pattern = mean_picture(same)
+    to_blank = change_to_blank(bench, pattern, usable)
+    to_pattern = change_to_pattern(bench, pattern, counts_of(to_blank.frames[-1]), usable)
+    if bench.exposure_s > darks[-1].exposure_s:  # the dark level is not to be extrapolated
+        darks = [*darks, bench.dark(bench.exposure_s)]
+    bench.shooter.reference = reference = make_reference((darks[0], darks[-1]), same)
+    return [
+        *camera_checks(series, reference, bench.facts, tolerated_drift=tolerated_drift),
+        *panel_checks(same, to_blank, to_pattern, usable),
+        fresh_frames([*darks[:2], *series, *to_blank.frames, *to_pattern.frames, *darks[2:]]),
+    ]
 
 
 def by_number(checks: list[Check]) -> list[Check]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from holocal.loop.devices import Frame
 from holocal.loop.preflight.checks import WARN, Check, check
-from holocal.loop.preflight.with_light import EXPOSURE_SHARES, Bench
+from holocal.loop.preflight.with_light import Bench
 from holocal.loop.reference import Mask
 
 Array = NDArray[np.float64]
@@ -29,36 +30,47 @@ SLOW = "Look for what is slow: the panel's settle time, the exposure, the camera
 SLOW_S = 10.0  # from a change of pattern to its picture; a 4K panel simulated on one core takes 2 s
 
 
-def panel_checks(bench: Bench, darks: Sequence[Frame], series: Sequence[Frame]) -> list[Check]:
-    """Return P10 and P11 from frames of level 0 and then, since it is to be left, of the random pattern again."""
-    assert bench.shooter.reference is not None
-    usable = bench.shooter.reference.usable
-    same = [_counts(frame) for frame, share in zip(series, EXPOSURE_SHARES, strict=True) if share == 1.0]
-    pattern = np.asarray(np.mean(same, axis=0))
+@dataclass(frozen=True)
+class Change:
+    """The frames after a change of pattern, and when each was there, seconds after it."""
 
-    def blank_is_settled(frames: list[Frame]) -> bool:
+    frames: list[Frame]
+    times_s: list[float]
+
+
+def change_to_blank(bench: Bench, pattern: Array, usable: Mask) -> Change:
+    """Return frames of level 0 everywhere until two are of one picture that is not the `pattern`'s, at most six."""
+
+    def settled(frames: list[Frame]) -> bool:
         if len(frames) < 2:
             return False
-        last = _counts(frames[-1])
-        apart = _distance(last, _counts(frames[-2]), usable)
+        last = counts_of(frames[-1])
+        apart = _distance(last, counts_of(frames[-2]), usable)
         return apart < SETTLED_SHARE * _distance(last, pattern, usable)
 
-    blanks, blank_times = _until(blank_is_settled, bench.blank)
-    blank = _counts(blanks[-1])
-    noise = min(_distance(same[0], same[1], usable), _distance(blank, _counts(blanks[-2]), usable))
-    noise = max(noise, 0.5)  # half a count: a noiseless camera still rounds
+    return _until(settled, bench.blank)
 
-    def share_of_blank(frame: Frame) -> float:
-        return _share(_counts(frame), pattern, blank, usable)
 
-    again, again_times = _until(
-        lambda frames: share_of_blank(frames[-1]) <= OLD_SHARE_LIMIT, lambda: bench.random(bench.exposure_s)
+def change_to_pattern(bench: Bench, pattern: Array, blank: Array, usable: Mask) -> Change:
+    """Return frames of the random pattern until one is its picture, at most six."""
+    return _until(
+        lambda frames: _share(counts_of(frames[-1]), pattern, blank, usable) <= OLD_SHARE_LIMIT,
+        lambda: bench.random(bench.exposure_s),
     )
+
+
+def panel_checks(same: Sequence[Frame], to_blank: Change, to_pattern: Change, usable: Mask) -> list[Check]:
+    """Return P10, P11a and P11b from frames of the random pattern, of level 0, and of the pattern again."""
+    pattern, blank = mean_picture(same), counts_of(to_blank.frames[-1])
+    pairs = (same[0], same[1]), tuple(to_blank.frames[-2:])
+    noise = min(_distance(counts_of(one), counts_of(other), usable) for one, other in pairs)
+    noise = max(noise, 0.5)  # half a count: a noiseless camera still rounds
     old = [
-        _unsettled([_share(_counts(frame), blank, pattern, usable) for frame in blanks]),
-        _unsettled([share_of_blank(frame) for frame in again]),
+        _unsettled([_share(counts_of(frame), blank, pattern, usable) for frame in to_blank.frames]),
+        _unsettled([_share(counts_of(frame), pattern, blank, usable) for frame in to_pattern.frames]),
     ]
-    waited_s = max(times[min(n, len(times) - 1)] for n, times in zip(old, (blank_times, again_times), strict=True))
+    changes = (to_blank.times_s, to_pattern.times_s)
+    waited_s = max(times[min(n, len(times) - 1)] for n, times in zip(old, changes, strict=True))
     settle = "Raise the panel's settle time in the rig's file (its driver's table) until this is 0."
     return [
         check(
@@ -72,7 +84,6 @@ def panel_checks(bench: Bench, darks: Sequence[Frame], series: Sequence[Frame]) 
         ),
         check("P11a", "frames of the former pattern after a change", float(max(old)), 0.0, "frames", settle),
         check("P11b", "from a change of pattern to its picture", round(waited_s, 3), SLOW_S, "s", SLOW, otherwise=WARN),
-        fresh_frames([*darks, *series, *blanks, *again]),
     ]
 
 
@@ -85,8 +96,18 @@ def fresh_frames(frames: Sequence[Frame]) -> Check:
     )
 
 
-def _until(done: Callable[[list[Frame]], bool], take: Callable[[], Frame]) -> tuple[list[Frame], list[float]]:
-    """Return frames until they are `done`, at most MOST_WAITED, and when each was there, seconds after the start."""
+def mean_picture(frames: Sequence[Frame]) -> Array:
+    """Return the mean counts of frames, (height, width)."""
+    return np.asarray(np.mean([counts_of(frame) for frame in frames], axis=0))
+
+
+def counts_of(frame: Frame) -> Array:
+    """Return a frame's counts as float64, (height, width)."""
+    return np.asarray(frame.counts, np.float64)
+
+
+def _until(done: Callable[[list[Frame]], bool], take: Callable[[], Frame]) -> Change:
+    """Return frames until they are `done`, at most MOST_WAITED."""
     began = time.monotonic()
     frames: list[Frame] = []
     times: list[float] = []
@@ -95,7 +116,7 @@ def _until(done: Callable[[list[Frame]], bool], take: Callable[[], Frame]) -> tu
         times.append(time.monotonic() - began)
         if done(frames):
             break
-    return frames, times
+    return Change(frames, times)
 
 
 def _unsettled(shares: Sequence[float]) -> int:
@@ -112,7 +133,3 @@ def _share(picture: Array, new: Array, old: Array, usable: Mask) -> float:
 
 def _distance(one: Array, other: Array, usable: Mask) -> float:
     return float(np.sqrt(np.mean((one - other)[usable] ** 2)))
-
-
-def _counts(frame: Frame) -> Array:
-    return np.asarray(frame.counts, np.float64)

@@ -13,7 +13,7 @@ from holocal.loop import gates
 from holocal.loop.devices import Frame
 from holocal.loop.preflight.checks import Check, check, unknown
 from holocal.loop.procedure import Shot
-from holocal.loop.reference import Reference, make_reference
+from holocal.loop.reference import Reference
 from holocal.loop.shooting import Shooter
 from holocal.records.facts import RigFacts
 
@@ -57,26 +57,35 @@ class Bench:
         return self.shooter.grab(self.shot("blank", np.zeros_like(self.pattern), self.exposure_s))
 
 
-def camera_checks(bench: Bench, darks: Sequence[Frame], tolerated_drift: float) -> tuple[list[Check], list[Frame]]:
-    """Return P07, P08, P09 and P12, and the frames; the shooter is told what was learnt of camera and light.
+def pattern_series(bench: Bench, offset: float) -> list[Frame]:
+    """Return frames of the random pattern at the exposure that is found for it, two of them at a part of it.
 
     Raises
     ------
     SafetyStop
         The picture clips at the camera's shortest exposure.
     """
-    first = find_exposure(bench, float(np.median(darks[-1].counts)))
+    first = find_exposure(bench, offset)
     bench.exposure_s = first.exposure_s
-    series = [first] + [bench.random(share * bench.exposure_s) for share in EXPOSURE_SHARES[1:]]
-    same = [frame for frame, share in zip(series, EXPOSURE_SHARES, strict=True) if share == 1.0]
-    bench.shooter.reference = reference = make_reference(darks, same)
+    return [first] + [bench.random(share * bench.exposure_s) for share in EXPOSURE_SHARES[1:]]
+
+
+def of_one_exposure(series: Sequence[Frame]) -> list[Frame]:
+    """Return the frames of a series that were taken at its whole exposure."""
+    return [frame for frame, share in zip(series, EXPOSURE_SHARES, strict=True) if share == 1.0]
+
+
+def camera_checks(
+    series: Sequence[Frame], reference: Reference, facts: RigFacts, *, tolerated_drift: float
+) -> list[Check]:
+    """Return P07, P08, P09 and P12 of a series of the random pattern."""
     rates = lit_rates(series, reference)
     drift = drift_per_frame(rates)
     return [
-        *count_checks(first, bench.facts),
+        *count_checks(series[0], facts),
         linearity_check(rates, drift, series),
         drift_check(drift, len(series), tolerated_drift),
-    ], series
+    ]
 
 
 def find_exposure(bench: Bench, offset: float) -> Frame:
