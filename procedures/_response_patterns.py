@@ -5,9 +5,9 @@ a period of 2 or 3 pixels; 2 is its middle. Rows that all alternate alike would 
 all show the same would give every camera pixel the same fringe; so the rows' roles are exchanged, and the fixed level
 is drawn anew, from cell to cell. Light then comes from everywhere, and fringes have every phase.
 
-Rows of a period of 2 or 3 have another property: each is the mirror image of the next, so a blur between neighbouring
-pixels leaves two phases only and scales their difference, by 1 - 4 k for a period of 2 and 1 - 3 k for 3, k being the
-share that a pixel takes from each neighbour. Two periods therefore tell a blur from a phase.
+Rows of a period of 2 or 3 are mirror images of their neighbours, so a blur between adjoining pixels (crosstalk) leaves
+two phases only and scales their difference, by 1 - 4 k for a period of 2 and 1 - 3 k for 3, k being the share that a
+pixel takes from each neighbour. One period cannot tell a blur from a shorter range of phase; two can.
 """
 
 from __future__ import annotations
