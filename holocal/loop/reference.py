@@ -33,7 +33,8 @@ class Reference:
     """The camera's dark level and noise in counts, the light's rate, and whether two frames of one pattern differ.
 
     `usable` (height, width) leaves out hot pixels. `rate` is the mean of the dark-subtracted picture of a random
-    pattern, counts per second: what the panel sends this way when it sends light everywhere.
+    pattern, counts per second: what the panel sends this way when it sends light everywhere; it was taken at
+    `exposure_s`.
     """
 
     offset: float
@@ -44,6 +45,7 @@ class Reference:
     rate: float
     noisy: bool
     usable: Mask
+    exposure_s: float = 0.0
 
     def signal(self, frame: Frame) -> Array:
         """Return the dark-subtracted counts of a frame, (height, width)."""
@@ -74,7 +76,7 @@ def make_reference(darks: Sequence[Frame], same: Sequence[Frame]) -> Reference:
     gain, flicker_squared = photon_transfer(signals, usable, read_variance)
     rate = float(np.mean([s[usable].mean() / frame.exposure_s for s, frame in zip(signals, same, strict=True)]))
     noisy = not any(np.array_equal(a.counts, b.counts) for a, b in pairwise(same))
-    return Reference(offset, dark_rate, read_variance, gain, flicker_squared, rate, noisy, usable)
+    return Reference(offset, dark_rate, read_variance, gain, flicker_squared, rate, noisy, usable, same[0].exposure_s)
 
 
 def not_hot(dark: Frame) -> Mask:

@@ -10,7 +10,7 @@ import logging
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -18,6 +18,7 @@ import numpy as np
 
 from holocal.errors import HolocalError, Interrupted
 from holocal.loop.devices import Frame, Repeatable, Rig
+from holocal.loop.drift import Drift, drift_over_run
 from holocal.loop.ending import dark_at_the_end
 from holocal.loop.gates import Verdict
 from holocal.loop.preflight import Check, Expectations, preflight, refuse_failed
@@ -251,13 +252,29 @@ class _Loop:
         self._stop_if_asked()
         self.observer.waiting("the verification")
         frames = self._frames(self.procedure.verification(state))
+        drift = self._drift()
         self.observer.waiting("the result")
         conclusion = self.procedure.conclude(state, frames)
-        result = self._result(conclusion, judgement)
+        if drift is not None and not drift.ok:
+            sentence = f"{conclusion.sentence}; but {drift.sentence}: measured anew it may differ"
+            conclusion = replace(conclusion, targets_met=False, sentence=sentence)
+        result = self._result(conclusion, judgement) | {"source_drift": None if drift is None else drift.relative}
         self.record.journal("verified", sentence=conclusion.sentence, after=conclusion.after, shots=self.shots)
         self.record.conclusion(conclusion, result)
         LOGGER.info("%s", conclusion.sentence)
         return RunResult(result, conclusion.sentence, self.record.directory)
+
+    def _drift(self) -> Drift | None:
+        """Return how far the light drifted since the pre-flight, and write it down."""
+        frames = self.shooter.frames
+        drift = drift_over_run(self.shooter, self.facts)
+        self.preflight_frames, self.shooter.frames = self.preflight_frames + self.shooter.frames - frames, frames
+        if drift is not None:
+            self.record.journal("drift", relative=drift.relative, limit=drift.limit, ok=drift.ok)
+            if not drift.ok:
+                LOGGER.warning("%s", drift.sentence)
+                self.observer.incident(drift.sentence)
+        return drift
 
     def _frames(self, shots: Iterator[Shot]) -> tuple[Frame, ...]:
         """Return a step's frames; a shot is computed only when the one before was taken."""

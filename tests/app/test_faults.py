@@ -112,7 +112,10 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
             corrections_choice="none",
             observer=Terminal(),
         )
-    assert done.result["preflight_frames"] == PREFLIGHT_FRAMES
+    assert done.result["preflight_frames"] == PREFLIGHT_FRAMES + 1  # and the pattern once more at the end
+    assert (
+        abs(done.result["source_drift"]) < 0.01
+    )  # noise alone
     return {**done.result, "maps": read_maps(done.directory / "maps.exr").channels}
 
 
@@ -121,6 +124,16 @@ def same_as(result: dict[str, Any], undisturbed: dict[str, Any]) -> bool:
     return all(result[key] == undisturbed[key] for key in ("before", "after", "steps", "targets_met")) and all(
         np.array_equal(values, undisturbed["maps"][name]) for name, values in maps.items()
     )
+
+
+def test_light_that_is_another_at_the_end_of_a_run_has_drifted(holocal, tiny):
+    answer = holocal(*RUN, "--set", f"faults.saturate_from_grab={GRAB}", "--set", "faults.saturate_factor=1.3")
+    assert answer.status == 3, answer.err
+    assert answer.json["targets_met"] is False
+    assert answer.json["source_drift"] == pytest.approx(0.3, abs=0.02)  # noise, and the dark level's share
+    (directory,) = (tiny / "runs").iterdir()
+    assert [line["ok"] for line in events(directory) if line["event"] == "drift"] == [False]
+    assert "changed by +" in answer.err
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.sets.replace(" ", "+"))

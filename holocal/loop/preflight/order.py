@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from holocal.loop.devices import Frame
+from holocal.loop.drift import random_pattern
 from holocal.loop.preflight.checks import Check, failed
 from holocal.loop.preflight.expectations import NOTHING_EXPECTED, Expectations
 from holocal.loop.preflight.panel import (
@@ -51,7 +52,7 @@ def preflight(
     DeviceError
         A device failed, or a frame is not what the camera says of itself.
     """
-    pattern = np.random.default_rng(0).integers(0, 2**facts.slm.bits, (facts.slm.height, facts.slm.width), np.uint8)
+    pattern = random_pattern(facts)
     bench = Bench(shooter, facts, pattern)
     shooter.light_off()
     checks = [
