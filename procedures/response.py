@@ -20,7 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from holocal.errors import RefusedError
 from holocal.estimate.fringes import FEWEST_LEVELS, Fringes
 from holocal.estimate.registration import blob_image
-from holocal.estimate.response import ResponseTable, interpolate_response, next_levels
+from holocal.estimate.response import ResponseTable, interpolate_response, next_levels, phase_difference, rms
 from holocal.loop.devices import Frame
 from holocal.loop.procedure import Conclusion, Judgement, Outcome, Plan, Shot
 from holocal.records.facts import RigFacts
@@ -284,6 +284,16 @@ class Response:
         pixels = choose_pixels(frames, state.dark, camera)
         light = light_of(frames, state.dark, pixels, camera=camera, exposure_s=frames[0].exposure_s)
         return conclusion(state, phases_of(light, shown, range(len(shown))))
+
+    def judge_truth(self, conclusion: Conclusion, truth: Mapping[str, Any]) -> dict[str, float]:
+        """Return the error of the table against a simulated rig's own, piston taken out, for `result.json` alone."""
+        if "response_rad" not in truth:
+            return {}
+        return {
+            "phase_error_rms_rad": rms(
+                phase_difference(conclusion.extra["response"]["phase_rad"], truth["response_rad"])
+            )
+        }
 
 
 def _shot(

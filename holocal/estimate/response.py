@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 LENGTHS = tuple(float(v) for v in np.geomspace(0.03, 2.0, 9))  # of the whole range of levels
 HEIGHTS_RAD = tuple(float(v) for v in np.geomspace(1e-3, 10.0, 13))  # of what is neither constant nor linear
-ROUGH_RAD = (0.0, 0.003, 0.01, 0.03)  # of single levels, off any curve
+ROUGH_RAD = (0.0, 0.003, 0.006, 0.012, 0.02, 0.035)  # of single levels, off any curve
 WIDE_RAD = 30.0  # prior standard deviation of constant and slope: more than any panel's range
 JITTER_RAD = 1e-5
 

@@ -120,6 +120,28 @@ def test_a_response_is_handed_to_the_levels():
     np.testing.assert_allclose(found.response_rad(515.0, 8), phase[0], atol=1e-6)
 
 
+def test_a_response_acts_on_its_own_line_only_and_says_so_at_others():
+    phase = np.linspace(0, 5.9, 256)[None, :]
+    found = corrections_of(accepted("response", {PHASE: phase}, wavelength_nm=515.0), fov_rad=FOV)
+    np.testing.assert_allclose(found.response_rad(516.5, 8), phase[0], atol=1e-6)
+    assert found.skipped(516.5) == []
+    assert found.response_rad(639.0, 8) is None
+    assert found.skipped(639.0) == ["the accepted response: measured at 515 nm, not at 639 nm"]
+
+
+def test_a_panel_of_few_levels_is_taken_to_share_the_turn_among_them():
+    table = corrections_of({}, fov_rad=FOV).response_rad(515.0, 4)
+    np.testing.assert_allclose(table, 2 * np.pi * np.arange(16) / 16)
+    short = accepted("response", {PHASE: np.linspace(0, 5.0, 16)[None]})
+    np.testing.assert_allclose(corrections_of(short, fov_rad=FOV).response_rad(515.0, 4)[-1], 5.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("phase", [np.zeros((1, 255)), np.full((1, 256), np.nan), np.zeros((1, 1)), np.zeros((2, 256))])
+def test_a_response_that_is_no_table_is_refused(phase):
+    with pytest.raises(InputError, match="a power of two"):
+        corrections_of(accepted("response", {PHASE: phase}), fov_rad=FOV)
+
+
 def test_corrections_that_change_nothing_are_left_out_and_named():
     nothing = (
         accepted("uniformity", {WEIGHT: np.ones((4, 4))}, extent_deg=EXTENT)

@@ -48,6 +48,17 @@ def test_an_ideal_response_given_as_a_table_changes_nothing():
     assert set(np.unique(difference % 256)) <= {0, 1, 255}
 
 
+@pytest.mark.parametrize("count", [2, 16, 128])
+def test_a_panel_of_fewer_levels_gets_no_level_beyond_its_last_and_the_nearest_within(count):
+    response = 0.9 * 2 * np.pi * np.arange(count) / count  # short of a turn: the gap goes to both its ends
+    phase = np.random.default_rng(3).uniform(-9, 9, (40, 50)).astype(np.float32)
+    levels = phase_to_levels(phase, response)
+    assert set(np.unique(levels)) == set(range(count))
+    reached = np.abs(np.angle(np.exp(1j * (phase - response[levels]))))
+    best = np.abs(np.angle(np.exp(1j * (phase[..., None] - response)))).min(axis=-1)
+    assert np.all(reached <= best + 2 * np.pi / 16384 + 1e-5)  # the look-up's step; float32 holds 9 rad to 1e-6
+
+
 @pytest.mark.parametrize("response", [np.zeros(255), np.full(256, np.nan), np.zeros((256, 2))])
 def test_a_response_that_is_none_is_refused(response):
     with pytest.raises(InputError):
