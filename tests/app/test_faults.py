@@ -113,9 +113,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
             observer=Terminal(),
         )
     assert done.result["preflight_frames"] == PREFLIGHT_FRAMES + 1  # and the pattern once more at the end
-    assert (
-        abs(done.result["source_drift"]) < 0.01
-    )  # noise alone
+    assert abs(done.result["source_drift"]) < 0.01  # noise alone
     return {**done.result, "maps": read_maps(done.directory / "maps.exr").channels}
 
 
