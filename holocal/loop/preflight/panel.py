@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from holocal.loop.devices import Frame
-from holocal.loop.preflight.checks import WARN, Check, check
+from holocal.loop.preflight.checks import FAIL, WARN, Check, check, unknown
 from holocal.loop.preflight.with_light import Bench
 from holocal.loop.reference import Mask
 
@@ -65,6 +65,21 @@ def panel_checks(same: Sequence[Frame], to_blank: Change, to_pattern: Change, us
     pairs = (same[0], same[1]), tuple(to_blank.frames[-2:])
     noise = min(_distance(counts_of(one), counts_of(other), usable) for one, other in pairs)
     noise = max(noise, 0.5)  # half a count: a noiseless camera still rounds
+    moved = check(
+        "P10",
+        "the panel moves the light: change over noise",
+        round(_distance(blank, pattern, usable) / noise, 2),
+        MOVED_LIMIT,
+        "",
+        "Check that the panel is on, gets this computer's output, and that the light is on and not blocked.",
+        at_least=True,
+    )
+    titles = "frames of the former pattern after a change", "from a change of pattern to its picture"
+    if moved.verdict == FAIL:
+        return [
+            moved,
+            *(unknown(f"P11{letter}", title, "See P10.") for letter, title in zip("ab", titles, strict=True)),
+        ]
     old = [
         _unsettled([_share(counts_of(frame), blank, pattern, usable) for frame in to_blank.frames]),
         _unsettled([_share(counts_of(frame), pattern, blank, usable) for frame in to_pattern.frames]),
@@ -73,17 +88,9 @@ def panel_checks(same: Sequence[Frame], to_blank: Change, to_pattern: Change, us
     waited_s = max(times[min(n, len(times) - 1)] for n, times in zip(old, changes, strict=True))
     settle = "Raise the panel's settle time in the rig's file (its driver's table) until this is 0."
     return [
-        check(
-            "P10",
-            "the panel moves the light: change over noise",
-            round(_distance(blank, pattern, usable) / noise, 2),
-            MOVED_LIMIT,
-            "",
-            "Check that the panel is on, gets this computer's output, and that the light is on and not blocked.",
-            at_least=True,
-        ),
-        check("P11a", "frames of the former pattern after a change", float(max(old)), 0.0, "frames", settle),
-        check("P11b", "from a change of pattern to its picture", round(waited_s, 3), SLOW_S, "s", SLOW, otherwise=WARN),
+        moved,
+        check("P11a", titles[0], float(max(old)), 0.0, "frames", settle),
+        check("P11b", titles[1], round(waited_s, 3), SLOW_S, "s", SLOW, otherwise=WARN),
     ]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import time
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -174,3 +175,21 @@ class LabRig:
 
 def open_rig(config: RigConfig) -> LabRig:
     return LabRig(config)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A device that answered; its handle is nothing to print."""
+
+    model: str
+    serial: str
+    handle: object = field(repr=False, default=None)
+
+
+def discover() -> list[Seen | dict[str, Any]]:
+    """Devices as dataclasses or as mappings: either will do."""
+    return [Seen("eye", "CAM-1", object()), {"model": "panel", "output": "HDMI-2", "width": 1920}]
+
+
+def discover_without_card() -> list[Seen]:
+    raise OSError("no network card")
