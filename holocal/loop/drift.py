@@ -7,12 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from holocal.loop.procedure import Shot
+from holocal.loop.procedure import Plan, Shot
 from holocal.loop.shooting import Shooter
 from holocal.records.facts import RigFacts
 
-# Frames are measured against one another, minutes apart: 10 % of brightness is what one step of a correction changes.
-LIMIT = 0.1
+# Of what a procedure stands within the pre-flight's few frames: over a run the light may go five times as far (2 and
+# 10 % for a procedure that says nothing), since frames are then compared with their neighbours, not all with the first.
+OVER_RUN = 5.0
 
 
 @dataclass(frozen=True)
@@ -20,7 +21,7 @@ class Drift:
     """The relative change of the light's rate from the pre-flight to the end of a run."""
 
     relative: float
-    limit: float = LIMIT
+    limit: float
 
     @property
     def ok(self) -> bool:
@@ -39,7 +40,7 @@ def random_pattern(facts: RigFacts) -> NDArray[np.uint8]:
     return np.random.default_rng(0).integers(0, 2**panel.bits, (panel.height, panel.width), np.uint8)
 
 
-def drift_over_run(shooter: Shooter, facts: RigFacts) -> Drift | None:
+def drift_over_run(shooter: Shooter, facts: RigFacts, plan: Plan) -> Drift | None:
     """Return the drift since the pre-flight, from one more frame; None where it saw no light."""
     reference = shooter.reference
     if reference is None or reference.rate <= 0:
@@ -55,4 +56,4 @@ def drift_over_run(shooter: Shooter, facts: RigFacts) -> Drift | None:
     )
     frame = shooter.frame(shot)
     rate = float(reference.signal(frame)[reference.usable].mean()) / frame.exposure_s
-    return Drift(rate / reference.rate - 1)
+    return Drift(rate / reference.rate - 1, OVER_RUN * plan.tolerated_drift)

@@ -61,7 +61,7 @@ class Plan:
     """What a run will do, known before anything is touched (``--dry-run``).
 
     `tolerated_drift` is the relative change of the light during the pre-flight's frames of one pattern that the target
-    still stands.
+    still stands; over the whole run it may be five times that.
     """
 
     frames: int

@@ -267,7 +267,7 @@ class _Loop:
     def _drift(self) -> Drift | None:
         """Return how far the light drifted since the pre-flight, and write it down."""
         frames = self.shooter.frames
-        drift = drift_over_run(self.shooter, self.facts)
+        drift = drift_over_run(self.shooter, self.facts, self.plan)
         self.preflight_frames, self.shooter.frames = self.preflight_frames + self.shooter.frames - frames, frames
         if drift is not None:
             self.record.journal("drift", relative=drift.relative, limit=drift.limit, ok=drift.ok)
