@@ -16,6 +16,6 @@ checkpoint      a frozen state to a file and back, in two slots
 figures         the data of the report's figures
 environment     versions, platform, commit, threads
 lock            one process per rig, one per run
-signals         Ctrl-C and SIGTERM end a run after its step
+signals         Ctrl-C, SIGTERM and SIGHUP while a rig is open
 ==============  ==========================================================
 """

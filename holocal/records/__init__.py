@@ -5,6 +5,8 @@ facts           what a rig says of itself: panel, camera, wavelengths
 plugins         what entry points offer; a broken one stops nothing
 rig             a rig's file: found, typed, fingerprinted
 rig_model       the simulated rig's file: every key with its range
+fault_model     what is to go wrong on a simulated rig
+safety          what no run may exceed
 validate        pydantic's complaints as errors that name file and key
 files           atomic writes, JSON, TOML
 reading         files that a user names: size checked, errors as sentences

@@ -6,6 +6,7 @@ The manual's table of faults is the table of these tests.
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -216,3 +217,18 @@ def test_an_unknown_or_impossible_fault_is_refused_by_its_key(holocal, tiny):
     assert holocal(*RUN, "--set", "faults.stale_at_grab=0").status == 2
     wide = holocal(*RUN, "--set", "faults.left_justified=true", "--set", "camera.bits=16")
     assert wide.status == 2 and "camera.bits" in wide.json["error"]["fix"]
+
+
+def test_the_manual_has_every_fault_gate_and_check():
+    manual = (Path(__file__).parents[2] / "docs" / "technician.md").read_text()
+    rows = [line for line in manual.splitlines() if line.startswith("|")]
+    faults = rows[rows.index("| fault | key | what notices it | exit status |") + 2 :]
+    told = {key for row in faults for key in re.findall(r"`([a-z_]+)[ `]", row.split("|")[2])}
+    assert told == set(FaultTable.model_fields)
+    statuses = {key: row.split("|")[-2] for row in faults for key in FaultTable.model_fields if f"`{key}" in row}
+    for case in CASES:
+        key = case.sets.split()[0].partition("=")[0]
+        assert str(case.status) in statuses[key], case
+    for name in ("misshapen", "lost-packets", "stale", "beyond-full-scale", "low-bits-zero", "constant", "identical"):
+        assert any(row.startswith(f"| {name} |") for row in rows)
+    assert all(any(row.startswith(f"| P{number:02d}") for row in rows) for number in range(1, 15))
