@@ -7,6 +7,7 @@ configuration   ``--set``, parameters, and ``config.toml`` with origins
 corrections     accepted maps applied to a scene
 rendering       a scene file -> the files of its hologram
 capturing       a frame shown and captured at an exposure found for it
+health          packages, plug-ins, devices seen, a rig's pre-flight
 terminal        progress and errors on stderr, results on stdout
 report          a run directory -> one self-contained page
 ==============  ==========================================================

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from holocal.errors import SafetyStop, UsageError
 from holocal.loop.devices import Frame, Rig
+from holocal.loop.ending import dark_at_the_end
 from holocal.loop.gates import Verdict
 from holocal.loop.procedure import Shot
-from holocal.loop.runner import dark_at_the_end
 from holocal.loop.shooting import Shooter
 from holocal.records.facts import CameraFacts
 from holocal.records.files import storage_error
@@ -52,16 +52,18 @@ def capture(rig: Rig, levels: NDArray[np.uint8], *, wavelength_m: float, exposur
     ------
     SafetyStop
         The picture clips at the camera's shortest exposure.
+    DeviceError
+        A device failed, or gave two unfit frames in a row.
     """
     facts = rig.facts()
     camera = facts.camera
     with dark_at_the_end(rig):
         shooter = Shooter(rig, facts, _ignore)
         if exposure_s is not None:
-            return shooter.grab(Shot("capture", levels, exposure_s, wavelength_m))
+            return shooter.frame(Shot("capture", levels, exposure_s, wavelength_m, fresh=False))
         wanted_s = float(np.sqrt(camera.exposure_min_s * camera.exposure_max_s))
         for _ in range(MOST_GRABS):
-            frame = shooter.grab(Shot("capture", levels, wanted_s, wavelength_m))
+            frame = shooter.frame(Shot("capture", levels, wanted_s, wavelength_m, fresh=False))
             level = float(np.percentile(frame.counts, 99.9)) / camera.full_scale
             if LEVEL_GOOD[0] <= level <= LEVEL_GOOD[1]:
                 return frame
@@ -109,4 +111,4 @@ def write_capture(path: Path, frame: Frame, metadata: dict[str, Any]) -> None:
 
 
 def _ignore(_verdict: Verdict, _shot: Shot, _frame: Frame) -> None:
-    """A capture has no journal: `grab` asks no gate."""
+    """A capture has no journal: a bad frame is taken again once, and two end it."""

@@ -13,7 +13,9 @@ from holocal.records.rig import RigConfig, load_rig, parse_overrides, resolve
 from holocal.records.validate import validated
 
 SCHEMA = 1
-RIG_KEYS = ("kind", "seed", "slm", "optics", "misalignment", "camera", "illumination", "light", "safety")
+RIG_KEYS = (
+    "kind", "seed", "simulated", "slm", "optics", "misalignment", "camera", "illumination", "light", "safety", "faults",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -26,6 +28,7 @@ class RunConfig:
     origins: Mapping[str, str]
     seed: int
     corrections: Mapping[str, str]
+    keep_frames: bool = False
 
     def toml(self) -> str:
         """Return the run's ``config.toml``."""
@@ -36,6 +39,7 @@ class RunConfig:
             "procedure": self.procedure,
             "seed": self.seed,
             "device": self.rig.device,
+            "keep_frames": self.keep_frames,
             "rig": {"name": self.rig.name, "source": self.rig.source, "tables": dict(self.rig.tables)},
             "parameters": self.parameters.model_dump(mode="json"),
             "corrections": dict(self.corrections),
@@ -95,6 +99,16 @@ def stored_rig(config: Mapping[str, Any]) -> RigConfig:
         key.removeprefix(prefix): value for key, value in config.get("origins", {}).items() if key.startswith(prefix)
     }
     return resolve(rig["name"], rig["source"], rig["tables"], origins, device=config.get("device", "cpu"))
+
+
+def without_faults(rig: RigConfig) -> tuple[RigConfig, dict[str, object]]:
+    """Return a simulated rig without its faults, and those that were active: a resumed run's drill is over."""
+    ended = {} if rig.model is None else rig.model.faults.active()
+    if not ended:
+        return rig, {}
+    tables = {key: value for key, value in rig.tables.items() if key != "faults"}
+    origins = {key: value for key, value in rig.origins.items() if not key.startswith("faults.")}
+    return resolve(rig.name, rig.source, tables, origins, device=rig.device), ended
 
 
 def stored_parameters(model: type[BaseModel], config: Mapping[str, Any]) -> BaseModel:

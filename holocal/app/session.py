@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +15,17 @@ from holocal.app import configuration
 from holocal.app.report import render_report
 from holocal.errors import DeviceError, RefusedError
 from holocal.loop.devices import Rig
+from holocal.loop.ending import close_quietly, dark_at_the_end
 from holocal.loop.lock import locked
-from holocal.loop.record import RunRecord
+from holocal.loop.preflight import Expectations
+from holocal.loop.record import RUN_TIME, RunRecord
 from holocal.loop.runner import Observer, RunResult, run
+from holocal.loop.shooting import EXPOSURE_EXCESS, guarded
+from holocal.loop.signals import interruptible, shielded
 from holocal.records import calibration, plugins
 from holocal.records.files import read_json
 from holocal.records.rig import RigConfig, identity
+from holocal.records.safety import safety_of
 
 LOGGER = logging.getLogger("holocal.app")
 CORRECTIONS = ("accepted", "none")
@@ -27,25 +33,93 @@ CORRECTIONS = ("accepted", "none")
 
 @contextmanager
 def opened_rig(config: RigConfig) -> Iterator[Rig]:
-    """Yield the opened rig of a configuration; it is closed on every way out."""
+    """Yield the opened rig of a configuration; it is closed on every way out, SIGTERM's and SIGHUP's too."""
     open_rig = plugins.load(plugins.RIGS, config.kind)
+    with interruptible():
+        with shielded(held_back=1) as signalled:  # a rig that was opened and not yet told of would not be closed
+            rig = _opened(open_rig, config)
+        try:
+            if signalled:
+                raise KeyboardInterrupt
+            _require_ceiling(rig, config)
+            yield rig
+        finally:
+            close_quietly(rig.close, f"rig {config.name}")
+
+
+def _opened(open_rig: Callable[[RigConfig], Rig], config: RigConfig) -> Rig:
     try:
-        rig: Rig = open_rig(config)
+        return open_rig(config)
     except OSError as error:
         raise DeviceError(
             f"rig {config.name} cannot be opened: {error}.", fix="Check its cables and power; `holocal doctor`."
         ) from error
-    try:
-        yield rig
-    finally:
-        rig.close()
 
 
 @contextmanager
 def claimed_rig(config: RigConfig) -> Iterator[Rig]:
-    """Yield the opened rig while no other process has it; `BusyError` when one does."""
-    with locked(calibration.rig_directory(config.name) / "lock", f"rig {config.name}"), opened_rig(config) as rig:
+    """Yield the opened rig while no other process has it, dark before and after; `BusyError` when one does."""
+    with locked(lock_of(config.name), f"rig {config.name}"), opened_rig(config) as rig, dark_at_the_end(rig):
+        guarded(rig.light.off, "the light source")  # a program that was killed may have left it on
+        guarded(rig.slm.blank, "the SLM")
         yield rig
+
+
+def lock_of(rig: str) -> Path:
+    """Return where a rig's lock is."""
+    return calibration.rig_directory(rig) / "lock"
+
+
+def _require_ceiling(rig: Rig, config: RigConfig) -> None:
+    """Raise `RefusedError` when a rig does not keep to the longest exposure of its own file, whatever opened it."""
+    limit_s, longest_s = safety_of(config).max_exposure_s, rig.facts().camera.exposure_max_s
+    if limit_s is not None and longest_s > limit_s * EXPOSURE_EXCESS:
+        raise RefusedError(
+            f"rig {config.name}: the camera allows {longest_s:g} s; safety.max_exposure_s = {limit_s:g} s.",
+            why="The rig's plug-in does not keep to the limit of its own file.",
+            fix=f"Have the plug-in {config.kind!r} limit its camera's exposure_max_s.",
+            measured=longest_s,
+            limit=limit_s,
+            code="exposure-ceiling",
+        )
+
+
+def expectations(config: RigConfig, entries: Mapping[str, str], *, identities: bool = False) -> Expectations:
+    """Return what a rig's pre-flight is held against.
+
+    Parameters
+    ----------
+    entries
+        Procedure -> the accepted run that is in force.
+    identities
+        Whether the rig must be that of the entries too; where they were loaded, that is known already.
+    """
+    file = {
+        f"{device}.serial": serial
+        for device in ("slm", "camera")
+        if (serial := dict(config.tables.get(device, {})).get("serial"))
+    }
+    expected: dict[str, Mapping[str, Any]] = {Path(config.source).name: file} if file else {}
+    if identities:
+        folder = calibration.rig_directory(config.name) / "entries"
+        expected |= {
+            f"the accepted {name} calibration": read_json(folder / entry / "identity.json")
+            for name, entry in entries.items()
+        }
+    return Expectations(
+        lock=lock_of(config.name),
+        identity=expected,
+        measured_utc={name: _measured_utc(entry) for name, entry in entries.items()},
+        max_age_days=safety_of(config).max_calibration_age_days,
+    )
+
+
+def _measured_utc(entry: str) -> datetime | None:
+    """Return when a run was begun, by the name of its directory; None for another name."""
+    try:
+        return datetime.strptime(entry.partition("-")[0], RUN_TIME).replace(tzinfo=UTC)
+    except ValueError:
+        return None
 
 
 def corrections(choice: str, rig: Mapping[str, Any]) -> dict[str, calibration.Accepted]:
@@ -91,6 +165,7 @@ def start(
     runs: Path,
     corrections_choice: str,
     observer: Observer,
+    keep_frames: bool = False,
 ) -> RunResult:
     """Return the result of a new run."""
     procedure = plugins.procedure(procedure_name)
@@ -101,7 +176,7 @@ def start(
         rig_identity = identity(device.facts())
         in_force = corrections(corrections_choice, rig_identity)
         entries = {name: found.entry for name, found in in_force.items()}
-        config = configuration.RunConfig(procedure_name, rig, values, origins, seed, entries)
+        config = configuration.RunConfig(procedure_name, rig, values, origins, seed, entries, keep_frames)
         record = RunRecord.create(runs, procedure_name, config=config.toml(), identity=rig_identity)
         with record.open():
             return run(
@@ -113,6 +188,8 @@ def start(
                 calibration=in_force,
                 observer=observer,
                 render=safe_report,
+                expected=expectations(rig, entries),
+                keep_frames=keep_frames,
             )
 
 
@@ -121,21 +198,26 @@ def resume(directory: Path, *, observer: Observer) -> RunResult:
     record = RunRecord.reopen(directory)
     config = record.config()
     _check_version(directory)
-    rig = configuration.stored_rig(config)
+    rig, ended = configuration.without_faults(configuration.stored_rig(config))
+    if ended:
+        record.opening.append(("faults-over", {"faults": ended}))
     procedure = plugins.procedure(config["procedure"])
     values = configuration.stored_parameters(procedure.parameters_model, config)
     with claimed_rig(rig) as device, record.open():
         rig_identity = identity(device.facts())
         record.check_identity(rig_identity)
+        in_force = _same_corrections(config.get("corrections", {}), rig_identity)
         return run(
             procedure,
             device,
             values,
             seed=int(config["seed"]),
             record=record,
-            calibration=_same_corrections(config.get("corrections", {}), rig_identity),
+            calibration=in_force,
             observer=observer,
             render=safe_report,
+            expected=expectations(rig, {name: found.entry for name, found in in_force.items()}),
+            keep_frames=bool(config.get("keep_frames", False)),
         )
 
 

@@ -72,12 +72,15 @@ class Terminal:
         self._console.print(escape(text), style=style or None)
 
     def preflight(self, checks: list[Check], seconds: float) -> None:
-        """Write the pre-flight's sum, and each check that failed."""
-        failed = [item for item in checks if item.verdict == "fail"]
-        passed = len(checks) - len(failed)
-        self.say(f"pre-flight  {passed} of {len(checks)} passed in {seconds:.1f} s", "red" if failed else "")
-        for item in failed:
-            self.say(f"  {item.id} {item.title}: {item.measured} {item.unit}, limit {item.limit}. {item.remedy}", "red")
+        """Write the pre-flight's sum, and each check that failed or warns."""
+        failed, warned = ([item for item in checks if item.verdict == verdict] for verdict in ("fail", "warn"))
+        passed = sum(item.verdict == "pass" for item in checks)
+        unknown = sum(item.verdict == "unknown" for item in checks)
+        more = f", {unknown} cannot be told here" if unknown else ""
+        self.say(f"pre-flight  {passed} of {len(checks)} passed{more} in {seconds:.1f} s", "red" if failed else "")
+        for item in (*failed, *warned):
+            said = f"  {item.id} {item.title}: {item.measured} {item.unit}, limit {item.limit}. {item.remedy}"
+            self.say(said, "red" if item in failed else "yellow")
 
     def waiting(self, what: str) -> None:
         """Say what the run waits for, where there is a terminal."""

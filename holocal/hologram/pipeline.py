@@ -6,7 +6,7 @@ Pure: the same inputs give the same bytes.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -27,7 +27,7 @@ from holocal.hologram.settings import HologramSettings
 from holocal.hologram.stored import Store
 from holocal.hologram.synthesis import synthesise
 
-__all__ = ["HologramSettings", "Rendered", "render", "render_image", "render_images"]
+__all__ = ["HologramSettings", "Rendered", "render", "render_image"]
 
 _BLOCK = 128  # rows at a time: float64 work that stays in the cache
 _WIDEST = 1.2  # times the band: the pupil's image is largest at one side of the panel, half as wide at the other
@@ -84,7 +84,7 @@ def render(
         Keeps phase functions between programs.
     """
     clock = Clock.start()
-    reference, transform = _reference(settings), _transform(settings)
+    reference, transform = reference_turns(settings), _transform(settings)
     _check_band(settings)
     clock.lap("table")
     reach = (transform.reach_rows, transform.reach_columns)
@@ -155,44 +155,14 @@ def render_image(
     return render([cloud], settings, encoder=encoder, keep_complex=keep_complex, response_rad=response_rad)
 
 
-def render_images(
-    intensity: ArrayLike,
-    settings: HologramSettings,
-    *,
-    seeds: Sequence[int],
-    keep_complex: bool = False,
-    response_rad: ArrayLike | None = None,
-) -> list[Rendered]:
-    """Return one frame per seed of the same image, as `render_image` would."""
-    return [
-        render_image(intensity, settings, seed=seed, keep_complex=keep_complex, response_rad=response_rad)
-        for seed in seeds
-    ]
-
-
-def _where(settings: HologramSettings) -> HologramSettings:
-    """Return settings that agree in all that the window and the reference depend on."""
-    plain = HologramSettings(settings.panel, settings.bench, settings.wavelength_m, (0.1, 0.1), settings.gaze_rad)
-    return replace(plain, device=settings.device)
-
-
 @lru_cache(maxsize=4)
 def _window(where: HologramSettings) -> PupilWindow:
     return pupil_window(where)
 
 
-def _reference(settings: HologramSettings) -> Series:
-    return _reference_at(_where(settings))
-
-
-@lru_cache(maxsize=4)
-def _reference_at(where: HologramSettings) -> Series:
-    return reference_turns(where)
-
-
 def _window_mask(settings: HologramSettings) -> NDArray[np.bool_]:
     """Return which bins of the compact spectrum lie in the pupil's image."""
-    return _mask_at(_where(settings))
+    return _mask_at(settings.geometry())
 
 
 @lru_cache(maxsize=2)
@@ -206,7 +176,7 @@ def _mask_at(where: HologramSettings) -> NDArray[np.bool_]:
 def _check_band(settings: HologramSettings) -> None:
     """Refuse a pupil whose light the panel's pixels cannot tell apart: it would come back on the pupil's other side."""
     band = 0.5 / settings.panel.pitch_m
-    widest = max(_window(_where(settings)).half_size_per_m)
+    widest = max(_window(settings.geometry()).half_size_per_m)
     if not widest <= _WIDEST * band:
         raise SamplingError(
             f"The pupil's image is {widest / band:.2f} times as wide as the panel's band, at "
@@ -221,7 +191,7 @@ def _check_band(settings: HologramSettings) -> None:
 def _transform(settings: HologramSettings) -> WindowedTransform:
     """Return the transform between the panel's pixels and the bins round the pupil's image."""
     panel = settings.panel
-    reach_x, reach_y = _window(_where(settings)).half_size_per_m
+    reach_x, reach_y = _window(settings.geometry()).half_size_per_m
     return WindowedTransform(
         panel.height,
         panel.width,

@@ -7,6 +7,7 @@ Divided by it, a hologram's spectrum is an image of the pupil's plane (docs/phys
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,26 +17,41 @@ from holocal.hologram.series import Series, fit_series
 from holocal.hologram.settings import HologramSettings
 from holocal.optics.bench import Array
 from holocal.optics.phase_function import pupil_rim
-from holocal.optics.raytrace import connect
+from holocal.optics.raytrace import Connection, connect
 
 # Degree 8 leaves 2e-4 rad on the nominal bench at gaze 0 and 3e-3 rad at a gaze of 13 degrees; 12 leaves 1e-5 rad.
 _DEGREE = 12
 
 
 def reference_turns(settings: HologramSettings) -> Series:
-    """Return the reference's phase psi0 on the panel, in turns (2 pi rad): minus the path from the pupil's centre."""
-    bench, panel = settings.bench, settings.panel
+    """Return the reference's phase psi0 on the panel, in turns (2 pi rad): minus the path from the pupil's centre.
 
-    def turns(slm_m: Array) -> Array:
-        found = connect(bench, slm_m, np.zeros(2), gaze_rad=settings.gaze_rad)
-        if not np.all(found.error_m < 1e-9):
-            raise InputError(
-                f"Rays from the pupil's centre to the panel land {float(np.nanmax(found.error_m)):.3g} m off.",
-                fix="Check the bench's misalignment and the gaze.",
-            )
-        return -found.path_m / settings.wavelength_m
+    Traced once (10 ms) for the last few settings.
+    """
+    return _reference_turns(settings.geometry())
 
-    return fit_series(turns, degree=_DEGREE, centre=(0.0, 0.0), half=panel.half_size_m)
+
+@lru_cache(maxsize=4)
+def _reference_turns(where: HologramSettings) -> Series:
+    return fit_series(
+        lambda slm_m: turns_at(where, slm_m), degree=_DEGREE, centre=(0.0, 0.0), half=where.panel.half_size_m
+    )
+
+
+def turns_at(settings: HologramSettings, slm_m: Array) -> Array:
+    """Return the reference's phase at panel points (..., 2), turns, by tracing."""
+    return -central_rays(settings, slm_m).path_m / settings.wavelength_m
+
+
+def central_rays(settings: HologramSettings, slm_m: Array) -> Connection:
+    """Return the rays from the pupil's centre to panel points (..., 2), or raise InputError where there is none."""
+    found = connect(settings.bench, slm_m, np.zeros(2), gaze_rad=settings.gaze_rad)
+    if not np.all(found.error_m < 1e-9):
+        raise InputError(
+            f"Rays from the pupil's centre to the panel land {float(np.nanmax(found.error_m)):.3g} m off.",
+            fix="Check the bench's misalignment and the gaze.",
+        )
+    return found
 
 
 @dataclass(frozen=True)

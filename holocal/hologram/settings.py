@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf, pi
 
 from holocal.errors import UsageError
@@ -88,3 +88,15 @@ class HologramSettings:
         for key, value, holds, limit in limits:
             if not holds:
                 raise UsageError(f"{key} is {value:g}; it must be {limit}.", measured=value, limit=limit)
+
+    def geometry(self) -> HologramSettings:
+        """Return settings that agree in all that the reference and the pupil's window depend on, and in the device.
+
+        Tables are kept by them: a scene at another depth, or by another method, finds those of the last one.
+        """
+        plain = HologramSettings(self.panel, self.bench, self.wavelength_m, (0.1, 0.1), self.gaze_rad)
+        return replace(plain, device=self.device)
+
+    def of_plans(self) -> HologramSettings:
+        """Return settings that agree in all that the warped engine's plans depend on, others at one value."""
+        return replace(self, depth_m=inf, iterations=0, device="cpu")

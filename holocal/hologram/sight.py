@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from holocal.errors import InputError
+from holocal.hologram.reference import central_rays, turns_at
 from holocal.hologram.series import Series, fit_series
 from holocal.hologram.settings import HologramSettings
 from holocal.optics.bench import Array
@@ -106,11 +106,12 @@ def sight(settings: HologramSettings) -> Sight:
         half=(float(reach[0]), float(reach[1])),
     )
 
-    def turns(s: Array) -> Array:
-        slm = to_panel.at(s)
-        return -connect(bench, slm, np.zeros(2), gaze_rad=settings.gaze_rad).path_m / settings.wavelength_m
-
-    reference = fit_series(turns, degree=_REFERENCE_DEGREE, centre=to_panel.centre, half=to_panel.half)
+    reference = fit_series(
+        lambda s: turns_at(settings, to_panel.at(s)),
+        degree=_REFERENCE_DEGREE,
+        centre=to_panel.centre,
+        half=to_panel.half,
+    )
     node = np.cos(np.pi * (np.arange(7) + 0.5) / 7)
     slm = np.stack(np.meshgrid(node * half[0], node * half[1]), axis=-1).reshape(-1, 2)
     return Sight(
@@ -125,13 +126,7 @@ def sight(settings: HologramSettings) -> Sight:
 
 def sight_of(settings: HologramSettings, slm_m: Array) -> Array:
     """Return the direction sines (..., 2) along which the pupil's centre sees panel points (..., 2)."""
-    found = connect(settings.bench, slm_m, np.zeros(2), gaze_rad=settings.gaze_rad)
-    if not np.all(found.error_m < 1e-9):
-        raise InputError(
-            f"Rays from the pupil's centre to the panel land {float(np.nanmax(found.error_m)):.3g} m off.",
-            fix="Check the bench's misalignment and the gaze.",
-        )
-    tangents = found.field_tan
+    tangents = central_rays(settings, slm_m).field_tan
     return np.asarray(tangents / np.sqrt(1 + np.sum(tangents**2, axis=-1, keepdims=True)))
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -54,8 +53,7 @@ def stored_plan(
 
 def plan_key(settings: HologramSettings, depth: Depth, cut: tuple[int, int] | None) -> str:
     """Return a name, 32 hexadecimal digits, for all that a plan depends on."""
-    plain = replace(settings, depth_m=np.inf, iterations=0, device="cpu")
-    return hashlib.sha256(repr((METHOD, plain, depth, cut)).encode()).hexdigest()[:32]
+    return hashlib.sha256(repr((METHOD, settings.of_plans(), depth, cut)).encode()).hexdigest()[:32]
 
 
 def to_arrays(plan: WarpedPlan) -> dict[str, Array]:

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from holocal.errors import InputError, SamplingError
+from holocal.errors import SamplingError
 from holocal.hologram.clock import Clock
 from holocal.hologram.depths import depth_bins
 from holocal.hologram.direct import direct_hologram
@@ -31,9 +31,6 @@ from holocal.optics.bench import Array
 
 _ENGINES_KEPT = 2  # 0.7 GB each on the 4K panel, points included
 _KEPT = 1  # sets of points whose transforms are kept: 0.5 GB for 750 x 750 points on the 4K panel
-_NEAREST_M = 1e-6  # a point nearer than a few waves to the pupil is not seen through it
-_WIDEST_TAN = 1e6  # 0.2 seconds of arc from a right angle
-_LARGEST_PHASE = 1e9  # rad: float64 holds it to 1e-7
 _DIMMEST, _BRIGHTEST = 1e-12, 1e12  # amplitudes: sums over 1e8 points and their squares stay normal float32 numbers
 _DENSE = 0.5  # share of lit points from which a scene's dark points are summed too: the transforms stay those of before
 _FEW = 5  # points of one depth are summed one by one: 4 FFT pairs each, where a new depth's plan and transform take 20
@@ -61,7 +58,6 @@ def synthesise(
     phase functions between programs.
     """
     lit = [cloud for cloud in clouds if np.any(cloud.amplitude > 0)]
-    _check_places(lit)
     lit, skipped = _in_range(lit)
     if len(lit) < len(clouds):
         skipped.append(f"{len(clouds) - len(lit)} of {len(clouds)} layers or views: dark")
@@ -74,24 +70,6 @@ def synthesise(
     if isinstance(settings.method, Zones):
         return _by_zones(lit, settings, reach, clock, skipped)
     return _by_patches(lit, settings, clock, skipped, store)
-
-
-def _check_places(clouds: list[PointCloud]) -> None:
-    """Refuse points whose light float64 cannot follow: the engine's phases would be noise, and say nothing of it."""
-    for cloud in clouds:
-        for what, unit, value, least, most in (
-            ("tangent", "", float(np.abs(cloud.field_tan).max()), 0.0, _WIDEST_TAN),
-            ("initial phase", " rad", float(np.abs(cloud.phase_rad).max()), 0.0, _LARGEST_PHASE),
-            ("distance", " m", float(cloud.distance_m.min()), _NEAREST_M, np.inf),
-        ):
-            if not least <= value <= most:
-                limit = most if value > most else least
-                raise InputError(
-                    f"A point's {what} is {value:.3g}{unit}; the limit is {limit:.3g}{unit}.",
-                    fix="Remove it from the scene.",
-                    measured=value,
-                    limit=limit,
-                )
 
 
 def _in_range(clouds: list[PointCloud]) -> tuple[list[PointCloud], list[str]]:
@@ -255,7 +233,7 @@ def _digest(values: NDArray[np.float64]) -> bytes:
 
 def _engine(settings: HologramSettings, store: Store | None) -> WarpedEngine:
     """Return the engine of a setting, whatever its depth and number of iterations."""
-    return _ENGINES.of(replace(settings, depth_m=np.inf, iterations=0, device="cpu"), store)
+    return _ENGINES.of(settings.of_plans(), store)
 
 
 @dataclass

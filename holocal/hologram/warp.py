@@ -12,10 +12,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.polynomial import chebyshev
 
 from holocal.hologram.phase_model import wanted_phase
-from holocal.hologram.series import Series, fit_series
+from holocal.hologram.series import Series, chebyshev_products, fit_series
 from holocal.hologram.settings import HologramSettings
 from holocal.hologram.sight import Sight
 from holocal.optics.bench import Array
@@ -59,9 +58,7 @@ class Box:
     def basis(self, s: Array) -> Array:
         """Return Chebyshev products of total degree up to `PANEL_DEGREE` at points (k, 2), (k, terms)."""
         local = (s - self.centre) / self.half
-        in_x, in_y = (chebyshev.chebvander(local[:, axis], PANEL_DEGREE) for axis in (0, 1))
-        pairs = [(i, j) for i in range(PANEL_DEGREE + 1) for j in range(PANEL_DEGREE + 1 - i)]
-        return np.stack([in_x[:, i] * in_y[:, j] for i, j in pairs], axis=-1)
+        return chebyshev_products(local[:, 0], local[:, 1], PANEL_DEGREE)
 
     def series(self, coefficients: Array) -> Series:
         """Return the polynomial with these coefficients (terms, ...) as a series over the box."""

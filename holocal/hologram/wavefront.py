@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from math import isfinite
 
 import numpy as np
-from numpy.polynomial import chebyshev
 
 from holocal.errors import InputError
+from holocal.hologram.series import chebyshev_products
 from holocal.optics.bench import Array
 from holocal.optics.zernike import zernike
 
@@ -79,6 +79,5 @@ class Wavefront:
 
 def field_basis(field_tan: Array, half_tan: tuple[float, float], degree: int) -> Array:
     """Return the Chebyshev products of total degree up to `degree` at tangents (n, 2), (n, terms); edges held."""
-    x = chebyshev.chebvander(np.clip(field_tan[:, 0] / half_tan[0], -1, 1), degree)
-    y = chebyshev.chebvander(np.clip(field_tan[:, 1] / half_tan[1], -1, 1), degree)
-    return np.stack([x[:, i] * y[:, j] for i in range(degree + 1) for j in range(degree + 1 - i)], axis=-1)
+    x, y = (np.clip(field_tan[:, axis] / half_tan[axis], -1, 1) for axis in (0, 1))
+    return chebyshev_products(x, y, degree)

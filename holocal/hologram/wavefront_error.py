@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from holocal.hologram.settings import HologramSettings, Warped, Zones
-from holocal.hologram.warped import accurate_plan, inside_outline
+from holocal.hologram.warp import Depth
+from holocal.hologram.warped import accurate_plan, inside_outline, warped_plan
 from holocal.hologram.zones import zone_borders, zone_count
 from holocal.optics.bench import Array, Bench, Panel, image_tangents
 from holocal.optics.phase_function import VirtualPoints, exact_phase
@@ -66,10 +67,13 @@ def _shared_phase(settings: HologramSettings, points: Array, slm_m: Array) -> tu
 def patch_wavefront_errors(settings: HologramSettings, *, samples: int = 15) -> Array:
     """Return, for samples x samples points over the field, the rms error of the warped engine's phase, (n,) radians.
 
+    The points lie at the settings' depth, on a sphere about the pupil's centre.
     Over the part of the footprint that lies on the panel, after the best piston; no tilt is taken out. NaN for points
     whose footprint misses the panel.
     """
     plan = accurate_plan(settings)
+    if np.isfinite(settings.depth_m):
+        plan = warped_plan(settings, Depth(1 / settings.depth_m), plan.layout.cut)
     half_x, half_y = settings.panel.half_size_m
     x, y = np.linspace(-half_x, half_x, _PANEL_SAMPLES[0]), np.linspace(half_y, -half_y, _PANEL_SAMPLES[1])
     slm = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2) * 0.999

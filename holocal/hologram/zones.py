@@ -11,12 +11,11 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.polynomial import chebyshev
 from scipy.spatial import ConvexHull
 
 from holocal.hologram.footprint import sample_footprint
 from holocal.hologram.reference import PupilWindow, pupil_window, reference_turns
-from holocal.hologram.series import Series, fit_series
+from holocal.hologram.series import Series, chebyshev_products, fit_series
 from holocal.hologram.settings import HologramSettings, Zones
 from holocal.optics.bench import Array
 from holocal.optics.phase_function import PhaseFunctions, VirtualPoints, phase_functions, pupil_rim, trace_points
@@ -96,9 +95,7 @@ class PointTable:
 
 def _field_basis(field_tan: Array, half_tan: tuple[float, float], degree: int) -> Array:
     """Return the Chebyshev products of total degree up to `degree`, (n, terms)."""
-    x = chebyshev.chebvander(field_tan[:, 0] / half_tan[0], degree)
-    y = chebyshev.chebvander(field_tan[:, 1] / half_tan[1], degree)
-    return np.stack([x[:, i] * y[:, j] for i in range(degree + 1) for j in range(degree + 1 - i)], axis=-1)
+    return chebyshev_products(field_tan[:, 0] / half_tan[0], field_tan[:, 1] / half_tan[1], degree)
 
 
 def zone_count(settings: HologramSettings) -> int:
@@ -235,14 +232,8 @@ def _band(factor: Series, shift: Series, samples: Array) -> tuple[float, float]:
         ahead, behind = samples.copy(), samples.copy()
         ahead[:, axis] += step
         behind[:, axis] -= step
-        own = (_at(factor, ahead) - _at(factor, behind)) / (2 * step)
+        own = (factor.at(ahead) - factor.at(behind)) / (2 * step)
         corner = np.array([-1.0, 1.0])
         tilt = shift.on_grid(shift.centre[0] + corner * shift.half[0], shift.centre[1] + corner * shift.half[1])
         found.append(float(np.max(np.abs(own[:, None] + tilt[..., axis].ravel()))))
     return found[0], found[1]
-
-
-def _at(series: Series, points: Array) -> Array:
-    """Return a series at scattered points (n, 2)."""
-    in_y, in_x = series.bases(points[:, 0], points[:, 1])
-    return np.asarray(np.einsum("ni,ij...,nj->n...", in_y, series.coefficients, in_x))

@@ -114,9 +114,21 @@ class Light(Protocol):
 class Rig(Protocol):
     """A bench: panel, camera, light, opened and closed together."""
 
-    slm: Slm
-    camera: Camera
-    light: Light
+    # Properties here, so that a rig may have its own types of device; plain attributes do.
+    @property
+    def slm(self) -> Slm:
+        """The panel."""
+        ...
+
+    @property
+    def camera(self) -> Camera:
+        """The camera."""
+        ...
+
+    @property
+    def light(self) -> Light:
+        """The source."""
+        ...
 
     def facts(self) -> RigFacts:
         """Return what the rig says of itself."""

@@ -7,12 +7,22 @@ from dataclasses import dataclass
 import numpy as np
 
 from holocal.loop.devices import Frame
+from holocal.loop.reference import Reference
+from holocal.loop.sameness import sameness
 from holocal.records.facts import CameraFacts
 
 # Two low bits that are zero in every one of 500,000 noisy pixels do not happen by chance (4**-500000).
 ZERO_BITS_LIMIT = 1
 # A frame that is mostly white is constant and the same again because it clips: the gate for clipping speaks.
 MOSTLY_SATURATED = 0.5
+# Two pictures of one pattern differ by 0.95 to 1.05 times their noise on the simulated bench; 2 leaves room for a panel
+# that flickers or a mount that moves more from step to step than during the pre-flight.
+UNCHANGED_LIMIT = 2.0
+# Independent speckle differs by 1 + its structure: where that is below 1 + 4, the two cannot be told apart for certain.
+LEAST_STRUCTURE = 4.0
+# Of the light that a random pattern, which scatters it everywhere, sends into the picture; holograms send more.
+UNLIT_LIMIT = 0.05
+LEAST_EXPECTED_COUNTS = 4.0  # mean of the picture: with less, the drift of a black level would pass for light
 
 
 @dataclass(frozen=True)
@@ -95,14 +105,14 @@ def stale(frame: Frame, last_id: int | None) -> Verdict:
 
 
 def identical(frame: Frame, last: Frame | None) -> Verdict:
-    """Return whether the frame differs from the last one; ask only when something was changed between the two."""
+    """Return whether the frame differs from the last one; ask where the camera has noise or something was changed."""
     same = last is not None and bool(np.array_equal(frame.counts, last.counts))
     return Verdict(
         "identical",
         not same,
         float(same),
         0.0,
-        "the frame is the last one again, bit by bit, though the pattern changed.",
+        "the frame is the last one again, bit by bit; noise alone makes two frames differ.",
         "Check that the camera delivers fresh frames.",
     )
 
@@ -133,26 +143,90 @@ def low_bits_zero(frame: Frame) -> Verdict:
     )
 
 
-def first_failure(
-    frame: Frame, camera: CameraFacts, *, last_id: int | None, last: Frame | None, lit: bool, changed: bool
-) -> Verdict | None:
-    """Return the first gate that a frame trips, clipping apart, or None.
+def unlit(frame: Frame, reference: Reference) -> Verdict:
+    """Return whether light is seen at all, where an exposure is long enough to see it."""
+    expected = reference.rate * frame.exposure_s
+    seen = float(np.mean(reference.signal(frame)[reference.usable]))
+    share = seen / expected if expected > 0 else 1.0
+    return Verdict(
+        "unlit",
+        expected < LEAST_EXPECTED_COUNTS or share >= UNLIT_LIMIT,
+        share,
+        UNLIT_LIMIT,
+        f"the frame has {share:.1%} of the light that the pre-flight's random pattern gave; at least "
+        f"{UNLIT_LIMIT:.0%} is expected of any pattern.",
+        "Check the light, its shutter and interlock, and that nothing is in the beam.",
+    )
 
-    Parameters
+
+def unchanged(frame: Frame, before: Frame | None, reference: Reference, camera: CameraFacts) -> Verdict:
+    """Return whether the picture differs from the one `before`, of another pattern, by more than noise.
+
+    Brightness apart, so that neither an exposure nor the light's drift hides that the panel kept its pattern. Pictures
+    without structure, or with less than their noise, are given the benefit of the doubt.
+    """
+    found = None if before is None else sameness(before, frame, reference, camera.full_scale)
+    difference = np.inf if found is None else found.difference
+    seen = found is not None and found.structure >= LEAST_STRUCTURE
+    return Verdict(
+        "unchanged",
+        not (seen and difference <= UNCHANGED_LIMIT),
+        difference,
+        UNCHANGED_LIMIT,
+        f"the picture is the former pattern's: it differs from it by {difference:.2f} times the noise, another "
+        f"pattern's would by more than {UNCHANGED_LIMIT:g}.",
+        "Check that the panel takes what it is sent: its cable, its output, its settle time (`holocal doctor`).",
+    )
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What a frame is held against.
+
+    Attributes
     ----------
+    last_id
+        The number of the last frame that came.
     last
-        The frame before, of any kind.
+        The last good frame, of any kind.
     lit
         Whether light was on: a dark frame may be constant.
     changed
-        Whether the pattern, the light or the exposure changed since `last`.
+        Whether the pattern, the light, the wavelength or the exposure changed since `last`.
+    other
+        The last good picture of another pattern, under the same light.
+    fresh
+        Whether the pattern is meant to give light, and another picture than `other`.
+    reference
+        What the pre-flight learnt; None where there was none.
     """
+
+    last_id: int | None = None
+    last: Frame | None = None
+    lit: bool = True
+    changed: bool = True
+    other: Frame | None = None
+    fresh: bool = True
+    reference: Reference | None = None
+
+
+def first_failure(frame: Frame, camera: CameraFacts, around: Surroundings) -> Verdict | None:
+    """Return the first gate that a frame trips, clipping apart, or None."""
     shape = misshapen(frame, camera)
     if not shape.ok:
         return shape
-    verdicts = [lost_packets(frame), stale(frame, last_id), beyond_full_scale(frame, camera)]
-    if lit and frame.saturated_fraction < MOSTLY_SATURATED:
-        verdicts += [constant(frame), low_bits_zero(frame)]
-        if changed:
-            verdicts.append(identical(frame, last))
+    reference = around.reference
+    verdicts = [lost_packets(frame), stale(frame, around.last_id), beyond_full_scale(frame, camera)]
+    if frame.saturated_fraction >= MOSTLY_SATURATED:
+        return next((verdict for verdict in verdicts if not verdict.ok), None)
+    noisy = reference is not None and reference.noisy  # then not even frames of one pattern are alike bit by bit
+    flat = constant(frame)
+    if flat.ok and (noisy or (around.lit and around.changed)):
+        verdicts.append(identical(frame, around.last))
+    if around.lit:
+        verdicts.append(low_bits_zero(frame))
+        if around.fresh:
+            verdicts.append(flat)
+            if reference is not None:
+                verdicts += [unlit(frame, reference), unchanged(frame, around.other, reference, camera)]
     return next((verdict for verdict in verdicts if not verdict.ok), None)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,9 +41,10 @@ class Judgement:
 class Shot:
     """One frame that a procedure wants.
 
-    `levels` None means a dark frame: light off. `measure` False marks a shot that only sets the exposure.
-    `clip_limit` is the share of pixels that may be at full scale before the runner halves the exposure. `fresh` False:
-    the picture need not change from the shot before.
+    `levels` None means a dark frame: light off. `clip_limit` is the share of pixels that may be at full scale before
+    the runner halves the exposure. `fresh` says that the pattern gives light, and a picture that differs from the
+    former pattern's by more than noise, so that a panel that kept its pattern, or a light that went out, is noticed;
+    set it False for steps too small to be seen in one frame, and for patterns that send no light into the picture.
     """
 
     label: str
@@ -57,13 +58,18 @@ class Shot:
 
 @dataclass(frozen=True)
 class Plan:
-    """What a run will do, known before anything is touched (``--dry-run``)."""
+    """What a run will do, known before anything is touched (``--dry-run``).
+
+    `tolerated_drift` is the relative change of the light during the pre-flight's frames of one pattern that the target
+    still stands; over the whole run it may be five times that.
+    """
 
     frames: int
     steps: int
     expected_seconds: float
     exposure_ceiling_s: float
     sentences: tuple[str, ...] = ()
+    tolerated_drift: float = 0.02
 
 
 @dataclass(frozen=True)
@@ -154,4 +160,16 @@ class Procedure(Protocol[State]):
 
     def conclude(self, state: State, frames: tuple[Frame, ...]) -> Conclusion:
         """Return the result, "after" measured on the verification's frames only."""
+        ...
+
+
+@runtime_checkable
+class AgainstTruth(Protocol):
+    """What a procedure adds when its result can be held against a simulated rig's truth.
+
+    The runner asks once the conclusion is drawn, for ``truth`` in `result.json` alone: no estimate can depend on it.
+    """
+
+    def against_truth(self, conclusion: Conclusion, truth: Mapping[str, Any]) -> dict[str, Any]:
+        """Return how far a conclusion is from the truth, JSON-ready."""
         ...

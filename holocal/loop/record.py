@@ -34,6 +34,7 @@ from holocal.records.maps import write_maps
 
 LETTERS = "abcdefghijkmnpqrstuvwxyz23456789"  # none that are mistaken for each other
 LOGGER = logging.getLogger("holocal")
+RUN_TIME = "%Y%m%dT%H%M%SZ"  # of a run directory's name
 MOST_BAD_FRAMES = 16  # kept of those that tripped a gate: 1.1 MB each
 
 
@@ -42,12 +43,13 @@ class RunRecord:
 
     def __init__(self, directory: Path) -> None:
         self.directory = directory
+        self.opening: list[tuple[str, dict[str, Any]]] = []  # journal lines of how this sitting began
         self._bad_frames = 0
 
     @classmethod
     def create(cls, runs: Path, procedure: str, *, config: str, identity: Mapping[str, Any]) -> RunRecord:
         """Return a record in a new directory ``<runs>/<UTC>-<procedure>-<4 letters>``."""
-        now = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
+        now = datetime.now(UTC).strftime(RUN_TIME)
         letters = "".join(secrets.choice(LETTERS) for _ in range(4))
         directory = make_directory(runs / f"{now}-{procedure}-{letters}")
         record = cls(directory.resolve())

@@ -1,6 +1,7 @@
 """The closed loop: shows, grabs, gates, journals, checkpoints, judges, verifies, stops. It knows no physics.
 
-Whatever happens, the panel is blanked and the light switched off before `run` returns or raises.
+Whatever happens, the panel is blanked and the light switched off before `run` returns or raises
+(`holocal.loop.ending`).
 """
 
 from __future__ import annotations
@@ -9,8 +10,7 @@ import logging
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -18,11 +18,15 @@ import numpy as np
 
 from holocal.errors import HolocalError, Interrupted
 from holocal.loop.devices import Frame, Repeatable, Rig
+from holocal.loop.drift import Drift, drift_over_run
+from holocal.loop.ending import dark_at_the_end
 from holocal.loop.gates import Verdict
-from holocal.loop.preflight import Check, preflight, refuse_failed
-from holocal.loop.procedure import Conclusion, Judgement, Outcome, Plan, Procedure, Shot
+from holocal.loop.preflight import Check, Expectations, preflight, refuse_failed
+from holocal.loop.preflight.checks import failed
+from holocal.loop.preflight.expectations import NOTHING_EXPECTED
+from holocal.loop.procedure import AgainstTruth, Conclusion, Judgement, Outcome, Plan, Procedure, Shot
 from holocal.loop.record import RunRecord
-from holocal.loop.shooting import Shooter
+from holocal.loop.shooting import Shooter, Taken
 from holocal.loop.signals import StopRequest, stop_requests
 from holocal.records.facts import RigFacts
 from holocal.records.files import json_ready
@@ -77,6 +81,8 @@ def run(
     calibration: Mapping[str, Any],
     observer: Observer,
     render: Callable[[Path], bytes] | None = None,
+    expected: Expectations = NOTHING_EXPECTED,
+    keep_frames: bool = False,
 ) -> RunResult:
     """Return the result of one closed loop on an opened rig; goes on where `record` has a checkpoint.
 
@@ -94,6 +100,10 @@ def run(
         Who is told how it goes.
     render
         Makes the report's bytes from the run's directory; the report and the manifest are written on every end.
+    expected
+        What the pre-flight holds the rig against besides its own facts.
+    keep_frames
+        Keep every frame, retakes and the pre-flight's included, with a journal line each: the run can be replayed.
 
     Raises
     ------
@@ -103,7 +113,10 @@ def run(
     with stop_requests() as stop:
         try:
             with dark_at_the_end(rig):
-                done = _Loop(procedure, rig, parameters, seed, record, calibration, observer, stop).run()
+                loop = _Loop(procedure, rig, parameters, seed, record, calibration, observer, stop, expected)
+                if keep_frames:
+                    loop.keep_frames()
+                done = loop.run()
         except (Exception, KeyboardInterrupt) as error:  # every end is written down, then raised
             written = _close_failed(record, error, render)
             if written is error:
@@ -112,15 +125,6 @@ def run(
         observer.waiting("the report")
         record.finish("complete", render=render)
         return done
-
-
-@contextmanager
-def dark_at_the_end(rig: Rig) -> Iterator[None]:
-    """Blank the panel and switch the light off on every way out, each though the other may fail."""
-    with ExitStack() as stack:
-        stack.callback(rig.slm.blank)
-        stack.callback(rig.light.off)  # called first
-        yield
 
 
 def _close_failed(record: RunRecord, error: BaseException, render: Callable[[Path], bytes] | None) -> BaseException:
@@ -163,20 +167,31 @@ class _Loop:
         calibration: Mapping[str, Any],
         observer: Observer,
         stop: StopRequest,
+        expected: Expectations,
     ) -> None:
         self.procedure, self.rig, self.parameters, self.seed = procedure, rig, parameters, seed
         self.record, self.calibration, self.observer, self.stop = record, calibration, observer, stop
+        self.expected = expected
         self.facts: RigFacts = rig.facts()
         self.plan: Plan = procedure.plan(self.facts, parameters)
         self.shooter = Shooter(rig, self.facts, self._incident)
         self.step = 0
+        self.now = PREFLIGHT_STEP  # which step's frames are being taken
         self.preflight_frames = 0
         self.shots: list[dict[str, Any]] = []
         self.seconds_before = 0.0
         self.started = time.monotonic()
 
+    def keep_frames(self) -> None:
+        """Have every frame from now on kept."""
+        self.shooter.taken = self._keep
+
     def run(self) -> RunResult:
         found = self.record.resume()
+        if self.shooter.taken is not None:
+            self.record.journal("camera", **asdict(self.facts.camera))
+        for event, values in self.record.opening:
+            self.record.journal(event, **values)
         self._preflight()
         if found is None:
             self.observer.waiting("the first pattern")
@@ -202,10 +217,14 @@ class _Loop:
         self.observer.waiting("the pre-flight")
         self._begin(PREFLIGHT_STEP)
         began = time.monotonic()
-        checks = preflight(self.shooter, self.facts, self.plan, self.record.directory)
+        checks = preflight(self.shooter, self.facts, self.plan, self.record.directory, self.expected)
         self.preflight_frames, self.shooter.frames = self.shooter.frames, 0
         self.record.preflight([item.as_json() for item in checks], frames=self.preflight_frames)
         self.observer.preflight(checks, time.monotonic() - began)
+        if refused := [item.id for item in failed(checks)]:
+            last = self.shooter.last_frame
+            name = None if last is None else self.record.keep_bad_frame(f"bad-preflight-{refused[0]}", last.counts)
+            self.record.journal("preflight", failed=refused, file=name)
         refuse_failed(checks)
 
     def _one_step(self, state: Any) -> tuple[Any, Judgement]:
@@ -233,13 +252,29 @@ class _Loop:
         self._stop_if_asked()
         self.observer.waiting("the verification")
         frames = self._frames(self.procedure.verification(state))
+        drift = self._drift()
         self.observer.waiting("the result")
         conclusion = self.procedure.conclude(state, frames)
-        result = self._result(conclusion, judgement)
+        if drift is not None and not drift.ok:
+            sentence = f"{conclusion.sentence}; but {drift.sentence}: measured anew it may differ"
+            conclusion = replace(conclusion, targets_met=False, sentence=sentence)
+        result = self._result(conclusion, judgement) | {"source_drift": None if drift is None else drift.relative}
         self.record.journal("verified", sentence=conclusion.sentence, after=conclusion.after, shots=self.shots)
         self.record.conclusion(conclusion, result)
         LOGGER.info("%s", conclusion.sentence)
         return RunResult(result, conclusion.sentence, self.record.directory)
+
+    def _drift(self) -> Drift | None:
+        """Return how far the light drifted since the pre-flight, and write it down."""
+        frames = self.shooter.frames
+        drift = drift_over_run(self.shooter, self.facts, self.plan)
+        self.preflight_frames, self.shooter.frames = self.preflight_frames + self.shooter.frames - frames, frames
+        if drift is not None:
+            self.record.journal("drift", relative=drift.relative, limit=drift.limit, ok=drift.ok)
+            if not drift.ok:
+                LOGGER.warning("%s", drift.sentence)
+                self.observer.incident(drift.sentence)
+        return drift
 
     def _frames(self, shots: Iterator[Shot]) -> tuple[Frame, ...]:
         """Return a step's frames; a shot is computed only when the one before was taken."""
@@ -265,6 +300,7 @@ class _Loop:
         return tuple(frames)
 
     def _begin(self, step: int) -> None:
+        self.now = step
         self.shooter.begin_step()
         if isinstance(self.rig, Repeatable):
             self.rig.begin_step(self.seed, step)
@@ -272,6 +308,23 @@ class _Loop:
     def _stop_if_asked(self) -> None:
         if self.stop:
             raise _interrupted(str(self.stop.name), self.record)
+
+    def _keep(self, taken: Taken) -> None:
+        frame, step = taken.frame, "pre" if self.now == PREFLIGHT_STEP else f"{self.now:02d}"
+        whole = frame.counts.dtype == np.uint16 and frame.counts.size > 0  # what else comes is kept by its gate
+        self.record.journal(
+            "grab",
+            step=self.now,
+            shot=taken.shot.label,
+            lit=taken.lit,
+            levels_sha256=taken.levels_sha256,
+            wavelength_m=taken.shot.wavelength_m,
+            asked_s=taken.asked_s,
+            exposure_s=frame.exposure_s,
+            frame_id=frame.frame_id,
+            lost_packets=frame.lost_packets,
+            file=self.record.keep_frame(f"grab-{step}-{frame.frame_id:06d}", frame.counts) if whole else None,
+        )
 
     def _incident(self, verdict: Verdict, shot: Shot, frame: Frame) -> None:
         name = self.record.keep_bad_frame(f"bad-{self.step:02d}-{shot.label}-{frame.frame_id}", frame.counts)
@@ -284,7 +337,8 @@ class _Loop:
         extra = dict(conclusion.extra)
         truth = self.rig.truth()
         if truth is not None:
-            extra["truth"] = {**truth, **extra.get("truth", {})}
+            judge = self.procedure if isinstance(self.procedure, AgainstTruth) else None
+            extra["truth"] = {**truth, **(judge.against_truth(conclusion, truth) if judge else {})}
         result = {
             "schema": SCHEMA,
             "procedure": self.procedure.name,

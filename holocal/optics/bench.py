@@ -1,6 +1,6 @@
 """The thesis's bench: an ellipsoid mirror whose foci are the eye's rotation centre and the panel's centre.
 
-Frames (metres, right-handed; docs/physics.md 1):
+Frames (metres; docs/physics.md 1):
 
 E  origin = rotation centre of the eye; +z = nominal gaze (eye to mirror), +y up, +x temporal (towards the panel).
 S  origin = panel centre; z = from the panel to the nominal mirror point, y = y_E on the nominal bench, x = y x z.
@@ -76,7 +76,7 @@ class Pose:
 
     @cached_property
     def matrix(self) -> Array:
-        """Rotation matrix Rz Ry Rx, (3, 3); right-handed about each axis."""
+        """Rotation matrix Rz Ry Rx, (3, 3): about x it takes +y towards +z, about y +z to +x, about z +x to +y."""
         (cx, cy, cz), (sx, sy, sz) = np.cos(self.rotation_rad), np.sin(self.rotation_rad)
         about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
         about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])

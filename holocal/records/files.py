@@ -144,7 +144,8 @@ def sha256_of(path: Path) -> str:
 def dump_toml(tables: Mapping[str, Any], *, comments: Mapping[str, str] | None = None, head: str = "") -> str:
     """Return nested tables as TOML text; `comments` (dotted key -> text) are set behind their values.
 
-    Values are strings, bools, numbers, and lists or tuples of these; None is left out, since TOML has no null.
+    Values are strings, bools, numbers, and lists or tuples of these and of tables; None is left out, since TOML has no
+    null.
     """
     lines = [f"# {line}" for line in head.splitlines()]
     _toml_table(tables, (), comments or {}, lines)
@@ -178,4 +179,7 @@ def _toml_value(value: Any) -> str:
         return repr(value) if math.isfinite(value) else ("nan" if math.isnan(value) else f"{value:+}")
     if isinstance(value, (list, tuple)):
         return "[" + ", ".join(_toml_value(item) for item in value) + "]"
+    if isinstance(value, Mapping):  # in a list: an array of tables
+        pairs = (f"{_toml_key(key)} = {_toml_value(item)}" for key, item in value.items() if item is not None)
+        return "{" + ", ".join(pairs) + "}"
     return json.dumps(str(value), ensure_ascii=False).replace("\x7f", "\\u007f")

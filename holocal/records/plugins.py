@@ -14,12 +14,15 @@ PROCEDURES = "holocal.procedures"
 SLMS = "holocal.slms"
 CAMERAS = "holocal.cameras"
 LIGHTS = "holocal.lights"
+# Functions () -> sequence of mappings or dataclasses: the devices that are there, none of them opened.
+DISCOVER = "holocal.discover"
 KINDS = {
     RIGS: "rig kind",
     PROCEDURES: "procedure",
     SLMS: "SLM driver",
     CAMERAS: "camera driver",
     LIGHTS: "light driver",
+    DISCOVER: "search for devices",
 }
 
 

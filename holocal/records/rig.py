@@ -21,6 +21,7 @@ from typing import Any
 
 from holocal.errors import ConfigError
 from holocal.records.facts import RigFacts
+from holocal.records.reading import checked_text
 from holocal.records.rig_model import SimulatedRig
 from holocal.records.validate import closest, validated
 
@@ -150,19 +151,14 @@ def _read(name_or_path: str) -> tuple[str, str, str]:
             fix=f"Known rigs: {', '.join(built_in) or 'none'}; or give the path of a .toml file.",
             code="unknown-rig",
         )
-    try:
-        size = path.stat().st_size
-        if size > LARGEST_FILE_BYTES:
-            raise ConfigError(
-                f"{path} has {size} bytes; a rig's file has at most {LARGEST_FILE_BYTES}.",
-                measured=size,
-                limit=LARGEST_FILE_BYTES,
-            )
-        return path.stem, str(path), path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"{path} cannot be read: {error.strerror}.", fix="Check the path.") from error
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{path} is not a text file: {error}.", fix="A rig's file is TOML in UTF-8.") from error
+    text = checked_text(
+        path,
+        largest_bytes=LARGEST_FILE_BYTES,
+        what="a rig's file",
+        fix="Give the TOML file that describes the rig.",
+        error=ConfigError,
+    )
+    return path.stem, str(path), text
 
 
 def _leaves(tables: Mapping[str, Any], prefix: str = "") -> list[str]:

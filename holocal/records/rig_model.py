@@ -9,6 +9,9 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from holocal.records.fault_model import FaultTable
+from holocal.records.safety import SafetyTable
+
 Pixels = Annotated[int, Field(ge=1, le=16384)]
 WavelengthNm = Annotated[float, Field(ge=200.0, le=12000.0)]
 AngleDeg = Annotated[float, Field(ge=-45.0, le=45.0)]
@@ -38,6 +41,7 @@ class SlmTable(Table):
     response: Literal["ideal"] | tuple[Level, ...] = "ideal"
     fill_factor: float | None = Field(default=None, gt=0.0, le=1.0)
     crosstalk_um: float = Field(default=0.0, ge=0.0, le=100.0)
+    serial: str | None = None  # of the panel that must be there; None: any
 
     @model_validator(mode="after")
     def _table_has_one_phase_per_level(self) -> SlmTable:
@@ -92,6 +96,7 @@ class CameraTable(Table):
     hot_pixels: int = Field(default=0, ge=0, le=1_000_000)
     psf_px: float = Field(default=0.0, ge=0.0, le=100.0)
     max_exposure_s: float = Field(default=1.0, gt=0.0, le=3600.0)
+    serial: str | None = None  # of the camera that must be there; None: any
 
 
 class IlluminationTable(Table):
@@ -111,3 +116,5 @@ class SimulatedRig(Table):
     misalignment: MisalignmentTable = MisalignmentTable()
     camera: CameraTable = CameraTable()
     illumination: IlluminationTable = IlluminationTable()
+    safety: SafetyTable = SafetyTable()
+    faults: FaultTable = FaultTable()

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from holocal.errors import InputError
 from holocal.records.files import one_line
+from holocal.records.reading import reading
 
 LARGEST_PIXELS = 64_000_000
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # ITU-R BT.709
@@ -85,10 +86,8 @@ def linear(values: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def check_size(path: Path) -> Any:
     """Return the header of an image after checking its existence, format and size; nothing is decoded."""
-    try:
+    with reading(path):
         size = path.stat().st_size
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}.", fix="Check the path.") from error
     if path.is_dir():
         raise InputError(f"{path} is a directory; an image file was expected.")
     if size == 0:

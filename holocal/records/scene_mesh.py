@@ -17,11 +17,13 @@ import trimesh
 
 from holocal.errors import InputError
 from holocal.records.files import one_line
+from holocal.records.reading import checked_bytes
 from holocal.records.scene import LUMINANCE, linear
 from holocal.records.scene_data import Array, Mesh
 
 LARGEST_FILE_BYTES = 2**28
 MOST_FACES = 20_000_000
+# trimesh has no error of its own: on damaged files it raises any of these, found by fuzzing
 _PARSING = (ValueError, IndexError, KeyError, TypeError, AttributeError, OverflowError, NotImplementedError)
 
 
@@ -43,7 +45,12 @@ def read_mesh(path: Path, *, srgb: bool = False) -> Mesh:
     kind = path.suffix.lower().removeprefix(".")
     if kind not in ("obj", "ply"):
         raise InputError(f"{path} is not an .obj or .ply file.", fix="Export the mesh as one of these.", measured=kind)
-    data = _bytes(path)
+    data = checked_bytes(
+        path,
+        largest_bytes=LARGEST_FILE_BYTES,
+        what="a mesh",
+        fix="Simplify the mesh; a view of 750 x 750 pixels shows half a million triangles at most.",
+    )
     if kind == "obj":
         data = _checked_obj(path, data)
     else:
@@ -53,21 +60,6 @@ def read_mesh(path: Path, *, srgb: bool = False) -> Mesh:
     faces = np.asarray(mesh.faces, np.int64)
     _check(path, vertices, faces)
     return Mesh(vertices, faces, _intensity(mesh, faces, srgb=srgb))
-
-
-def _bytes(path: Path) -> bytes:
-    try:
-        size = path.stat().st_size
-        if size > LARGEST_FILE_BYTES:
-            raise InputError(
-                f"{path} has {size / 2**20:.0f} MiB.",
-                fix="Simplify the mesh; a view of 750 x 750 pixels shows half a million triangles at most.",
-                measured=size,
-                limit=LARGEST_FILE_BYTES,
-            )
-        return path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}.", fix="Check the path.") from error
 
 
 def _parsed(path: Path, data: bytes, kind: str) -> Any:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from holocal.errors import InputError
+from holocal.records.reading import reading
 from holocal.records.scene_data import ScatteredPoints
 from holocal.records.validate import closest
 from holocal.units import DEGREE
@@ -31,16 +32,9 @@ def read_points(path: Path) -> ScatteredPoints:
     InputError
         The file is absent or no such table; names the line and the column of the first value that cannot be.
     """
-    try:
-        with path.open(encoding="utf-8-sig") as file:
-            head, names = _header(path, file)
-            table = _table(path, file, head)
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}.", fix="Check the path.") from error
-    except UnicodeDecodeError as error:
-        raise InputError(
-            f"{path} is not a text file: {error.reason} at byte {error.start}.", fix="Save it as UTF-8."
-        ) from error
+    with reading(path), path.open(encoding="utf-8-sig") as file:
+        head, names = _header(path, file)
+        table = _table(path, file, head)
     theta_x, theta_y, distance, intensity = (table[:, names.index(name)] for name in COLUMNS)
     limits = (
         ("theta_x_deg", theta_x, np.abs(theta_x) < LARGEST_ANGLE_DEG, "between -60 and 60 degrees"),

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel
 
 from holocal.errors import ConfigError, InputError
+from holocal.records.reading import checked_text
 from holocal.records.validate import validated
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -20,22 +21,14 @@ LARGEST_FILE_BYTES = 4 * 2**20  # a thousand views are 100 KB
 
 def read_tables(path: Path) -> dict[str, Any]:
     """Return a TOML file's tables without its schema, or raise InputError: absent, not TOML, another schema."""
+    text = checked_text(
+        path,
+        largest_bytes=LARGEST_FILE_BYTES,
+        what="a list of images",
+        fix="Give the TOML file that lists the images.",
+    )
     try:
-        size = path.stat().st_size
-        if size > LARGEST_FILE_BYTES:
-            raise InputError(
-                f"{path} has {size} bytes; a list of images has at most {LARGEST_FILE_BYTES}.",
-                fix="Give the TOML file that lists the images.",
-                measured=size,
-                limit=LARGEST_FILE_BYTES,
-            )
-        tables = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}.", fix="Check the path.") from error
-    except UnicodeDecodeError as error:
-        raise InputError(
-            f"{path} is not a text file: {error.reason} at byte {error.start}.", fix="Save it as UTF-8."
-        ) from error
+        tables = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{path} is not a TOML file: {error}.", fix="Correct that line.") from error
     schema = tables.pop("schema", SCHEMA)

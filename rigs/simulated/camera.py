@@ -1,26 +1,28 @@
 """What the camera's lens makes of the field in the pupil: the power on every pixel.
 
-    E(s) = 1 / wavelength  sum_q  U(q) exp(i k q . s)        s = direction sines in P; |E|^2 = power per unit of d^2 s
-
-A speckle grain is 0.3 pixel (docs/physics.md 6), so the field is computed at 4 x 4 points in every pixel (fewer where
+A speckle grain is 0.3 pixel (docs/physics.md 6), so the field is computed at 5 x 5 points in every pixel (fewer where
 the panel is small and the grains are large), at the directions that the lens really sends there, and its intensity is
-integrated, not sampled.
+integrated, not sampled. A plain mean over the points would leave 2 % of the grains' contrast: the weights are those
+that integrate best over the frequencies that the pupil passes, and take in one point of each neighbour.
 """
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from holocal.optics.bench import Array
-from rigs.simulated.pupil import Complex, PupilGrid, unit_phase
+from rigs.simulated.image_plane import ImagePlane
+from rigs.simulated.pupil import Complex, PupilGrid
 
-GRAIN_SHARE = 0.92  # of a speckle grain: the distance of the points; 4 per pixel for the 4K panel and a pupil of 3 mm
-NUFFT_EPS = 1e-3  # relative, of the field
+# Distance of the points, of a speckle grain: the integral over a pixel is then right to 0.3 to 0.9 % rms (tested).
+# Where the panel's edges and not the round pupil make the grain, its spectrum is fuller at high frequencies.
+GRAIN_SHARE, GRAIN_SHARE_PANEL = 0.82, 0.65
+SMALL_PANEL = 0.75  # of the pupil: light of one direction that fills less of it is cut by the panel's edges
 
 
 @dataclass(frozen=True)
@@ -47,71 +49,126 @@ class Lens:
         half = np.tan(self.field_rad / 2)
         u = (2 * columns + 1 - self.width) / self.width * half
         v = (self.height - 1 - 2 * rows) / self.width * half
+        c, s = np.cos(self.rotation_rad), np.sin(self.rotation_rad)
+        turned_x, turned_y = c * u - s * v, s * u + c * v
+        if not (self.k1 or self.k2):
+            return turned_x, turned_y
         r = np.hypot(u, v)
         ideal = r.copy()
-        for _ in range(12 if self.k1 or self.k2 else 0):  # Newton: the distortion is given forward, this is its inverse
+        for _ in range(12):  # Newton: the distortion is given forward, this is its inverse
             sq = ideal * ideal
             value = ideal * (1 + self.k1 * sq + self.k2 * sq * sq) - r
             ideal -= value / np.maximum(1 + 3 * self.k1 * sq + 5 * self.k2 * sq * sq, 0.1)
         scale = np.where(r > 0, ideal / np.where(r > 0, r, 1.0), 1.0)
-        c, s = np.cos(self.rotation_rad), np.sin(self.rotation_rad)
-        return scale * (c * u - s * v), scale * (s * u + c * v)
+        return scale * turned_x, scale * turned_y
 
 
 class PupilToPicture:
     """The map from the field in the pupil to the power on every pixel, for one wavelength, lens and focus.
 
-    `reach_m` is the widest part of the pupil that light of one direction fills: a small panel fills less than all.
+    `reach_m` is the widest part of the pupil, along x and y, that light of one direction fills: a small panel fills
+    less than all.
     """
 
     def __init__(
-        self, grid: PupilGrid, lens: Lens, wavelength_m: float, *, focus_m: float = np.inf, reach_m: float = np.inf
+        self,
+        grid: PupilGrid,
+        lens: Lens,
+        wavelength_m: float,
+        *,
+        focus_m: float = np.inf,
+        reach_m: tuple[float, float] = (np.inf, np.inf),
     ) -> None:
-        import finufft
-
         self.lens = lens
-        k = 2 * np.pi / wavelength_m
-        grain = wavelength_m / min(reach_m, grid.x_m[-1] - grid.x_m[0])
-        pixel = 2 * np.tan(lens.field_rad / 2) / lens.width
-        n = self._subsamples = max(2, int(np.ceil(pixel / (GRAIN_SHARE * grain))))
-        shape = (lens.height * n, lens.width * n)
-        columns = (np.arange(shape[1]) + 0.5) / n - 0.5
-        rows = (np.arange(shape[0]) + 0.5) / n - 0.5
-        phases = np.empty((2, *shape), np.float32)
-        self._lit = np.empty(shape, np.bool_)
-        for low in range(0, shape[0], 256):  # in bands: the whole picture in float64 would be half a gigabyte
-            band = slice(low, low + 256)
-            sines = _direction_sines(lens, columns, rows[band])
-            for out, sine, pitch, carrier in zip(phases, sines, grid.pitch_m, grid.carrier, strict=True):
-                out[band] = k * pitch * (sine - carrier)
-            # The panel sends no light further than half a period of the fine grid: what lies beyond is dark.
-            self._lit[band] = (np.abs(phases[:, band]) <= np.pi).all(axis=0)
-        phases[:, ~self._lit] = 0.0
-        self._plan = finufft.Plan(
-            2,
-            (len(grid.x_m), len(grid.y_m)),
-            eps=NUFFT_EPS,
-            isign=1,
-            upsampfac=1.25,  # half the memory of 2, and no slower
-            dtype="complex64",
-            nthreads=torch.get_num_threads(),
-        )
-        self._plan.setpts(phases[0].ravel(), phases[1].ravel())
-        cell = grid.pitch_m[0] * grid.pitch_m[1] / wavelength_m
-        self._per_pixel = (_pixel_solid_angle(lens) * cell**2).astype(np.float32)
-        self._focus: Complex | None = None
-        if np.isfinite(focus_m):
-            x, y = grid.x_m[:, None], grid.y_m[None]
-            # what a point at that distance sends, exp(+i k |p - q|), is made flat
-            self._focus = unit_phase(-k * (x * x + y * y) / (np.sqrt(focus_m**2 + x * x + y * y) + focus_m))
+        edges = _direction_sines(lens, *(np.arange(size + 1.0) - 0.5 for size in (lens.width, lens.height)))
+        self._plane = plane = ImagePlane(grid, wavelength_m, edges, focus_m=focus_m)
+        self._per_pixel = (_solid_angle(edges) * plane.power_per_square).astype(np.float32)
+        self._seen = _lit_part(plane.phases(edges)[2])
+        grains = self._grains(grid, reach_m, wavelength_m)
+        self._points = [points_per_pixel(*g) for g in grains]
+        self._weights = [pixel_weights(n, g) for n, (g, _) in zip(self._points, grains, strict=True)]
+        columns, rows = (_points(part, n) for part, n in zip(self._seen, self._points, strict=True))
+        shape = (len(rows), len(columns))
+        x, y, lit = np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.bool_)
+
+        def locate(low: int) -> None:  # in bands: the whole picture in float64 would be half a gigabyte
+            band = slice(low, low + 64)
+            x[band], y[band], lit[band] = plane.phases(_direction_sines(lens, columns, rows[band]))
+
+        with ThreadPoolExecutor(max(1, torch.get_num_threads())) as pool:
+            list(pool.map(locate, range(0, shape[0], 64)))
+        self._plan = plane.plan(x.ravel(), y.ravel())
+        self._lit = None if lit.all() else torch.from_numpy(lit)
+        self._out = np.empty(shape, np.complex64)
+
+    def _grains(self, grid: PupilGrid, reach_m: tuple[float, float], wavelength_m: float) -> list[tuple[float, float]]:
+        """Return, across the picture and down, the speckle grains in a pixel and how far apart points may lie."""
+        widths = float(grid.x_m[-1] - grid.x_m[0]), float(grid.y_m[-1] - grid.y_m[0])
+        c, s = abs(np.cos(self.lens.rotation_rad)), abs(np.sin(self.lens.rotation_rad))
+        turned = (c * reach_m[0] + s * reach_m[1], s * reach_m[0] + c * reach_m[1]) if s else reach_m
+        pixel = 2 * np.tan(self.lens.field_rad / 2) / self.lens.width
+        return [
+            (
+                pixel * min(reach, width) / wavelength_m,
+                GRAIN_SHARE if reach >= SMALL_PANEL * width else GRAIN_SHARE_PANEL,
+            )
+            for reach, width in zip(turned, widths, strict=True)
+        ]
 
     def power(self, field: Complex) -> NDArray[np.float32]:
         """Return the power on every pixel, (height, width), of a field as `PanelToPupil.field` gives it."""
-        wave = field if self._focus is None else field * self._focus
-        e = torch.from_numpy(self._plan.execute(np.ascontiguousarray(wave))).view(self._lit.shape)
-        intensity = e.real.square().addcmul_(e.imag, e.imag).mul_(torch.from_numpy(self._lit)).numpy()
-        mean = cv2.resize(intensity, (self.lens.width, self.lens.height), interpolation=cv2.INTER_AREA)
-        return np.asarray(mean * self._per_pixel)
+        self._plan.execute(self._plane.spectrum(field), out=self._out.ravel())
+        out = torch.from_numpy(self._out)
+        if self._lit is not None:
+            out.mul_(self._lit)
+        squares = torch.view_as_real(out).square_().flatten(1)
+        (columns, rows), (across, down) = self._seen, self._points
+        height = rows.stop - rows.start
+        lines = torch.zeros((height, squares.shape[1]))
+        for k, weight in enumerate(self._weights[1].tolist()):
+            lines.add_(squares[k : k + down * (height - 1) + 1 : down], alpha=weight)
+        both = torch.from_numpy(np.repeat(self._weights[0], 2))  # for real and imaginary parts
+        picture = np.zeros((self.lens.height, self.lens.width), np.float32)
+        picture[rows, columns] = (lines.unfold(1, len(both), 2 * across) @ both).numpy()
+        picture *= self._per_pixel
+        return picture
+
+
+def _lit_part(corners: NDArray[np.bool_]) -> tuple[slice, slice]:
+    """Return the columns and rows of pixels of which any corner, (height + 1, width + 1), is lit; at least one each."""
+    pixels = corners[1:, 1:] | corners[1:, :-1] | corners[:-1, 1:] | corners[:-1, :-1]
+    parts = []
+    for axis in (0, 1):
+        lit = np.flatnonzero(pixels.any(axis=axis))
+        parts.append(slice(int(lit[0]), int(lit[-1]) + 1) if lit.size else slice(0, 1))
+    return parts[0], parts[1]
+
+
+def _points(pixels: slice, per_pixel: int) -> Array:
+    """Return evenly spaced points of these pixels, and one more on either side."""
+    count = (pixels.stop - pixels.start) * per_pixel + 2
+    return np.asarray(pixels.start - 0.5 + (np.arange(count, dtype=np.float64) - 0.5) / per_pixel)
+
+
+def points_per_pixel(grains: float, share: float) -> int:
+    """Return how many points a pixel of so many speckle grains needs, no further apart than this share of one."""
+    return max(2, int(np.ceil(grains / share)))
+
+
+def pixel_weights(points: int, grains: float) -> NDArray[np.float32]:
+    """Return the weights, (points + 2,), that integrate an intensity over a pixel from evenly spaced values of it.
+
+    The outermost two belong to the neighbouring pixels. They are the least squares over the frequencies that are there,
+    up to `grains` cycles per pixel and rarer towards them; the mean is exact.
+    """
+    place = (np.arange(points + 2) - (points + 1) / 2) / points
+    frequency = (np.arange(400) + 0.5) / 400 * grains
+    rare = 1 - frequency / grains
+    waves = np.cos(2 * np.pi * np.outer(frequency, place)) * rare[:, None]
+    system = np.concatenate([waves, np.full((1, len(place)), 1e4)])
+    wanted = np.append(np.sinc(frequency) * rare, 1e4)
+    found = np.linalg.lstsq(system, wanted, rcond=None)[0]  # of least norm, and so symmetric
+    return np.asarray(found / found.sum(), np.float32)
 
 
 def _direction_sines(lens: Lens, columns: Array, rows: Array) -> tuple[Array, Array]:
@@ -121,10 +178,9 @@ def _direction_sines(lens: Lens, columns: Array, rows: Array) -> tuple[Array, Ar
     return tan_x * cosine, tan_y * cosine
 
 
-def _pixel_solid_angle(lens: Lens) -> Array:
-    """Return d^2 s of every pixel, (height, width), from the direction sines of its corners."""
-    edges_x, edges_y = (np.arange(n + 1, dtype=np.float64) - 0.5 for n in (lens.width, lens.height))
-    x, y = _direction_sines(lens, edges_x, edges_y)
+def _solid_angle(corners: tuple[Array, Array]) -> Array:
+    """Return d^2 s of every pixel, (height, width), from the direction sines of all corners."""
+    x, y = corners
     across, down = (np.diff(x, axis=1), np.diff(y, axis=1)), (np.diff(x, axis=0), np.diff(y, axis=0))
     mean_x, mean_y = ((a[1:] + a[:-1]) / 2 for a in across)
     step_x, step_y = ((d[:, 1:] + d[:, :-1]) / 2 for d in down)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections import OrderedDict
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -28,6 +29,7 @@ from rigs.simulated.sensor import Sensor
 FLUX_E_PER_S_M2 = 1e15
 EXPOSURE_MIN_S = 3e-5
 LINE_WIDTH_M = 1e-9
+PATTERNS_KEPT = 8  # shown again, they cost only the sensor: a pre-flight goes to and fro between two
 SMALLEST_DEMAGNIFICATION = 1 / 2.7  # of the panel anywhere in the field: 1 / 2.85 on the nominal bench
 
 
@@ -55,8 +57,7 @@ class Optics:
     _wavelength_m: float | None = None
     _to_pupil: PanelToPupil | None = None
     _to_picture: PupilToPicture | None = None
-    _shown: tuple[str, float] | None = None
-    _power: NDArray[np.float32] | None = None
+    _powers: OrderedDict[tuple[str, float], NDArray[np.float32]] = field(default_factory=OrderedDict)
 
     @property
     def panel(self) -> Panel:
@@ -94,15 +95,18 @@ class Optics:
 
     def power(self, levels: NDArray[np.uint8], sha256: str, wavelength_m: float) -> NDArray[np.float32]:
         """Return the power on every pixel, (height, width), in square metres of evenly lit panel."""
-        if self._shown != (sha256, wavelength_m):
+        known = self._powers.get((sha256, wavelength_m))
+        if known is None:
             if self._wavelength_m != wavelength_m:
                 self._build(wavelength_m)
             assert self._to_pupil is not None
             assert self._to_picture is not None
-            self._power = self._to_picture.power(self._to_pupil.field(self.modulation(levels)))
-            self._shown = (sha256, wavelength_m)
-        assert self._power is not None
-        return self._power
+            known = self._to_picture.power(self._to_pupil.field(self.modulation(levels)))
+            self._powers[sha256, wavelength_m] = known
+            if len(self._powers) > PATTERNS_KEPT:
+                self._powers.popitem(last=False)
+        self._powers.move_to_end((sha256, wavelength_m))
+        return known
 
     def _build(self, wavelength_m: float) -> None:
         self._to_pupil = self._to_picture = None  # two wavelengths at once would double the memory
@@ -114,7 +118,8 @@ class Optics:
             fill_factor=self.tables.slm.fill_factor,
             pupil_edge_m=self.tables.optics.pupil_edge_mm * MM,
         )
-        reach_m = SMALLEST_DEMAGNIFICATION * 2 * max(self.panel.half_size_m)
+        half_x, half_y = self.panel.half_size_m
+        reach_m = (SMALLEST_DEMAGNIFICATION * 2 * half_x, SMALLEST_DEMAGNIFICATION * 2 * half_y)
         self._to_picture = PupilToPicture(self._to_pupil.grid, self.lens, wavelength_m, reach_m=reach_m)
         self._wavelength_m = wavelength_m
 
@@ -205,7 +210,9 @@ class SimulatedCamera:
             rate = bench.optics.power(bench.levels, bench.sha256, bench.wavelength_m) * np.float32(FLUX_E_PER_S_M2)
         else:
             rate = np.zeros((self._facts.height, self._facts.width), np.float32)
-        what = (*bench.step, bench.sha256, bench.wavelength_m, bench.light_on, self._exposure_s)
+        # Without light it does not matter what is on the panel: a run that is resumed has another pattern there.
+        seen = (bench.sha256, bench.wavelength_m) if bench.light_on else ()
+        what = (*bench.step, *seen, bench.light_on, self._exposure_s)
         bench.grabs[what] = bench.grabs.get(what, 0) + 1
         counts = self._sensor.expose(rate, self._exposure_s, (*what, bench.grabs[what]))
         self._frame_id += 1

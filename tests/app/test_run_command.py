@@ -70,7 +70,7 @@ def test_a_run_that_misses_its_target_exits_3_and_cannot_be_accepted(holocal):
         ("too-bright", 5, "too-bright"),
         ("left-justified", 4, "P07b"),
         ("frozen-panel", 4, "P10"),
-        ("read-back", 6, "slm-read-back"),
+        ("read-back", 4, "P05"),
     ],
 )
 def test_each_fault_ends_with_its_exit_status_a_reason_and_a_report(holocal, workplace, fault, status, code):
@@ -91,12 +91,12 @@ def test_each_fault_ends_with_its_exit_status_a_reason_and_a_report(holocal, wor
 def test_a_disk_without_room_is_refused_before_the_light_goes_on(holocal, monkeypatch):
     from lab_bench.rig import Lamp
 
-    from holocal.loop import preflight
+    from holocal.loop.preflight import without_light
 
     def never(lamp: Lamp) -> None:
         raise AssertionError("the light went on")
 
-    monkeypatch.setattr(preflight, "RECORD_BYTES", 2**60)
+    monkeypatch.setattr(without_light, "RECORD_BYTES", 2**60)
     monkeypatch.setattr(Lamp, "on", never)
     answer = holocal(*RUN)
     assert answer.status == 4

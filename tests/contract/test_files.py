@@ -24,7 +24,13 @@ SCALARS = st.one_of(
     st.text(st.characters(codec="utf-8", exclude_categories=["Cs"])),
 )
 TABLES = st.recursive(
-    st.dictionaries(KEYS, st.one_of(SCALARS, st.lists(SCALARS, max_size=3)), max_size=4),
+    st.dictionaries(
+        KEYS,
+        st.one_of(
+            SCALARS, st.lists(SCALARS, max_size=3), st.lists(st.dictionaries(KEYS, SCALARS, max_size=3), max_size=3)
+        ),
+        max_size=4,
+    ),
     lambda inner: st.dictionaries(KEYS, inner, max_size=3),
     max_leaves=6,
 )

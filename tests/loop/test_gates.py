@@ -19,7 +19,8 @@ def frame(counts=None, *, number=2, saturated=0.0, lost=0) -> Frame:
 
 
 def judged(found: Frame, *, last: Frame | None = None, last_id: int | None = 1, lit=True, changed=True):
-    failure = gates.first_failure(found, CAMERA, last_id=last_id, last=last, lit=lit, changed=changed)
+    around = gates.Surroundings(last_id=last_id, last=last, lit=lit, changed=changed)
+    failure = gates.first_failure(found, CAMERA, around)
     return None if failure is None else (failure.gate, failure.measured, failure.limit)
 
 

@@ -256,9 +256,9 @@ def test_a_panel_of_four_levels_is_refused_before_the_first_frame():
 def test_the_truth_of_a_simulated_rig_is_held_against_the_table_and_nothing_else(short):
     done, procedure, _ = short
     conclusion = procedure.conclude(procedure.state, procedure.verified)
-    told = procedure.judge_truth(conclusion, {"response_rad": (SHORT + 3.0).tolist()})
+    told = procedure.against_truth(conclusion, {"response_rad": (SHORT + 3.0).tolist()})
     assert told["phase_error_rms_rad"] == pytest.approx(error_of(done.result, SHORT), rel=1e-6)
-    assert procedure.judge_truth(conclusion, {"fill_factor": 0.93}) == {}
+    assert procedure.against_truth(conclusion, {"fill_factor": 0.93}) == {}
 
 
 def test_the_plan_holds_what_a_run_takes_at_most(short):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from planes import WAVELENGTH, axes, relative
 
 from holocal.errors import UsageError
 from holocal.optics.propagate import (
@@ -15,14 +16,7 @@ from holocal.optics.propagate import (
     rayleigh_sommerfeld_sum,
 )
 
-WAVELENGTH = 515e-9
 K = 2 * np.pi / WAVELENGTH
-
-
-def axes(rows, columns, pitch):
-    y = ((rows - 1) / 2 - np.arange(rows)) * pitch[0]
-    x = (np.arange(columns) - (columns - 1) / 2) * pitch[1]
-    return np.meshgrid(x, y)
 
 
 def gaussian_beam(x, y, z, *, waist=(60e-6, 90e-6), focus=(-2e-3, 3e-3), centre=(70e-6, -40e-6), tilt=(0.012, -0.02)):
@@ -38,10 +32,6 @@ def gaussian_beam(x, y, z, *, waist=(60e-6, 90e-6), focus=(-2e-3, 3e-3), centre=
         field = field * np.sqrt(q0 / q) * np.exp(1j * K * moved**2 / (2 * q))
         field = field * np.exp(1j * K * (t * (u - c) - t**2 * z / 2))
     return field
-
-
-def relative(found, wanted):
-    return float(np.linalg.norm(found - wanted) / np.linalg.norm(wanted))
 
 
 def test_a_tilted_plane_wave_gains_the_phase_of_its_kz_under_a_soft_aperture():

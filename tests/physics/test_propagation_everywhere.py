@@ -8,6 +8,7 @@ from decimal import Decimal, getcontext
 import numpy as np
 import pytest
 import torch
+from planes import WAVELENGTH, axes, relative
 from scipy.special import erfc
 
 from holocal.errors import SamplingError, SamplingWarning, UsageError
@@ -22,7 +23,6 @@ from holocal.optics.propagate import (
     rayleigh_sommerfeld_sum,
 )
 
-WAVELENGTH = 515e-9
 PITCH = 3.74e-6
 
 
@@ -33,8 +33,7 @@ def beams(shape, *, finer=1):
     Sampled at the centres of a grid that many times finer.
     """
     rows, columns = (n * finer for n in shape)
-    y = (((rows - 1) / 2 - np.arange(rows)) / finer)[:, None]
-    x = ((np.arange(columns) - (columns - 1) / 2) / finer)[None, :]
+    x, y = axes(rows, columns, (1 / finer, 1 / finer))
     field = np.zeros((rows, columns), complex)
     for cx, cy, fx, fy, strength in ((5, -3, 0.02, 0.01, 1), (-8, 6, -0.3, 0.12, 0.7j), (2, 9, 0.16, -0.35, -0.5)):
         field += strength * np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / 9**2 + 2j * np.pi * (fx * x + fy * y))
@@ -43,8 +42,8 @@ def beams(shape, *, finer=1):
 
 def soft_disc(n, radius, *, sigma=2.0, finer=1):
     """A disc whose edge is blurred by a Gaussian, lengths in pixels of the coarse grid."""
-    x = (np.arange(n * finer) - (n * finer - 1) / 2) / finer
-    return torch.from_numpy(0.5 * erfc((np.hypot(*np.meshgrid(x, x)) - radius) / (np.sqrt(2) * sigma)) + 0j)
+    radii = np.hypot(*axes(n * finer, n * finer, (1 / finer, 1 / finer)))
+    return torch.from_numpy(0.5 * erfc((radii - radius) / (np.sqrt(2) * sigma)) + 0j)
 
 
 def pixels(shape, pitch, count, seed=0):
@@ -59,10 +58,6 @@ def finer_than_the_orders(shape, pitch, z):
     """How much finer the sum's grid must be for its own diffraction orders to miss the window."""
     reach = max(np.sin(np.arctan(n * step / z)) * step for n, step in zip(shape, pitch, strict=True))
     return int(np.ceil(reach / WAVELENGTH + 0.5))
-
-
-def relative(found, wanted):
-    return float(np.linalg.norm(found - wanted) / np.linalg.norm(wanted))
 
 
 def noise(shape, dtype=torch.complex128, seed=0):

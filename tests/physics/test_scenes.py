@@ -94,6 +94,14 @@ def test_a_table_becomes_points_at_the_tangents_of_its_angles_without_the_dark_o
     np.testing.assert_array_equal(cloud.phase_rad, RANDOM.at(np.zeros((3, 2)))[[0, 2]])
 
 
+def test_a_point_too_near_to_be_shown_is_refused_with_its_table_unless_it_is_dark():
+    angles, distances = np.zeros((2, 2)), np.array([1.0, 1e-9])
+    dark = ScatteredPoints(angles, distances, np.array([1.0, 0.0]))
+    assert len(table_points(dark, initial_phase=RANDOM)) == 1
+    with pytest.raises(InputError, match="distance is 1e-09 m; the limit is 1e-06 m"):
+        table_points(ScatteredPoints(angles, distances, np.ones(2)), initial_phase=RANDOM)
+
+
 # -- layers -----------------------------------------------------------------------------------------------------------
 
 

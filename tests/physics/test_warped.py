@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from random_points import cloud
 
 from holocal.errors import SamplingError
 from holocal.hologram import direct, synthesis
@@ -22,6 +23,7 @@ from holocal.hologram.synthesis import synthesise
 from holocal.hologram.warp import Depth
 from holocal.hologram.warped import accurate_plan, inside_outline, warped_plan
 from holocal.hologram.wavefront import Wavefront
+from holocal.hologram.wavefront_error import patch_wavefront_errors
 from holocal.optics.bench import Bench, Panel, Pose
 from holocal.optics.phase_function import VirtualPoints, exact_phase
 
@@ -37,18 +39,6 @@ MISALIGNED = Bench(mirror=Pose((0.3 * DEG, -0.2 * DEG, 0.3 * DEG), (3e-4, -2e-4,
 def by_patches(monkeypatch):
     """However few the points: a scene of a handful would be summed point by point."""
     monkeypatch.setattr(synthesis, "_FEW", 0)
-
-
-def cloud(settings, count, *, seed=0, distance=np.inf, aperture=None):
-    rng = np.random.default_rng(seed)
-    half = np.tan(np.asarray(settings.fov_rad) / 2)
-    return PointCloud(
-        rng.uniform(-1, 1, (count, 2)) * half,
-        np.broadcast_to(np.asarray(distance, float), count).copy(),
-        rng.uniform(0.2, 1, count),
-        2 * np.pi * rng.random(count),
-        aperture,
-    )
 
 
 def field_of(clouds, settings):
@@ -83,6 +73,11 @@ def test_the_error_against_the_direct_sum_is_below_the_one_asked_for(settings, a
 def test_the_error_at_4k_is_below_the_one_asked_for(accuracy):
     settings = replace(FULL, method=Warped(accuracy))
     assert relative_error([cloud(settings, 300)], settings) < accuracy
+
+
+def test_the_table_of_errors_is_of_the_settings_depth():
+    settings = replace(COARSE, depth_m=0.4, method=Warped(0.1))
+    assert np.nanmax(patch_wavefront_errors(settings, samples=5)) < 0.1  # the plan for infinity is 9 rad off there
 
 
 @pytest.mark.parametrize("depth", [Depth(0.0), Depth(4.0), Depth(4.0, flat=True)], ids=["far", "25 cm", "25 cm, flat"])

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from random_points import cloud
 
 from holocal.errors import HolocalError, InputError, SamplingError, UsageError
 from holocal.hologram import warped
@@ -22,17 +23,6 @@ from holocal.optics.bench import Bench, Panel, Pose
 
 DEG = np.pi / 180
 BASE = HologramSettings(Panel(64, 48, 3.74e-6), Bench(), 515e-9, (12 * DEG, 10 * DEG))
-
-
-def cloud(settings, count, *, seed=0, distance=np.inf):
-    rng = np.random.default_rng(seed)
-    half = np.tan(np.asarray(settings.fov_rad) / 2)
-    return PointCloud(
-        rng.uniform(-1, 1, (count, 2)) * half,
-        np.broadcast_to(np.asarray(distance, float), count).copy(),
-        rng.uniform(0.2, 1, count),
-        2 * np.pi * rng.random(count),
-    )
 
 
 def error_of(scene, settings, pixels=300):

@@ -67,7 +67,7 @@ def on_panel(width: int, height: int, *, runs: int) -> Iterator[Row]:
 
 
 def one_iteration(width: int, height: int, *, runs: int) -> Row:
-    """Return the cost of one IFTA iteration: eleven less one, in tenths."""
+    """Return the cost of one IFTA iteration: six less one, in fifths."""
     unit, settings = Unit(height, width), settings_of(width, height, Warped())
     found = synthesise(picture(settings), settings)
     assert found is not None

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Sequence
+from functools import wraps
 from typing import Annotated, Any
 
 import typer
@@ -77,8 +78,23 @@ COMMANDS: tuple[Callable[..., None], ...] = (
     procedures.procedures,
     doctor.doctor,
 )
+
+
+def _saying_so(command: Callable[..., None]) -> Callable[..., None]:
+    """Return a command that ends with our error when it is interrupted: typer would end it without a word."""
+
+    @wraps(command)
+    def interruptible(*arguments: Any, **options: Any) -> None:
+        try:
+            command(*arguments, **options)
+        except KeyboardInterrupt as error:  # SIGINT; of a command that has a rig open SIGTERM and SIGHUP too
+            raise Interrupted("stopped by the operator.") from error
+
+    return interruptible
+
+
 for command in COMMANDS:
-    app.command()(command)
+    app.command()(_saying_so(command))
 
 
 def invoke(arguments: Sequence[str]) -> int:

@@ -19,6 +19,9 @@ def run(
     dry_run: options.DryRun = False,
     device: options.Device = "cpu",
     corrections: options.Corrections = "accepted",
+    keep_frames: Annotated[
+        bool, typer.Option("--keep-frames", help="Keep every frame: the run can be replayed without the bench.")
+    ] = False,
     yes: options.Yes = False,
     debug: options.Debug = False,
 ) -> None:
@@ -52,5 +55,6 @@ def run(
             runs=runs,
             corrections_choice=corrections,
             observer=terminal,
+            keep_frames=keep_frames,
         )
     raise typer.Exit(report_run(done, as_json=json))

@@ -80,9 +80,9 @@ def convergence(steps: Sequence[Mapping[str, Any]]) -> str | None:
             axes.axhline(target, color=TARGET, linestyle="--", linewidth=1.3)
             axes.annotate(
                 f"target {target:.3g}",
-                (1.0, target),
+                (0.01, target),  # on the left: the last step should end near the line
                 xycoords=("axes fraction", "data"),
-                ha="right",
+                ha="left",
                 va="bottom",
                 color=TARGET,
             )

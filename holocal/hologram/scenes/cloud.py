@@ -21,7 +21,8 @@ def table_points(points: ScatteredPoints, *, initial_phase: InitialPhase) -> Poi
     """
     field_tan = np.tan(points.angle_rad)
     phase = initial_phase.at(field_tan)
-    return PointCloud(field_tan, points.distance_m, np.sqrt(points.intensity), phase).lit()
+    lit = points.intensity != 0
+    return PointCloud(field_tan[lit], points.distance_m[lit], np.sqrt(points.intensity[lit]), phase[lit])
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,10 @@ import numpy as np
 from holocal.errors import InputError
 from holocal.optics.bench import Array
 
+_NEAREST_M = 1e-6  # a point nearer than a few waves to the pupil is not seen through it
+_WIDEST_TAN = 1e6  # 0.2 seconds of arc from a right angle
+_LARGEST_PHASE = 1e9  # rad: float64 holds it to 1e-7
+
 
 @dataclass(frozen=True)
 class Aperture:
@@ -21,6 +25,8 @@ class Aperture:
 @dataclass(frozen=True)
 class PointCloud:
     """Luminous points, coherent with each other.
+
+    A cloud with any light has tangents up to 1e6, distances from 1e-6 m and phases up to 1e9 rad.
 
     Parameters
     ----------
@@ -57,6 +63,24 @@ class PointCloud:
             )
         if not (np.all(np.isfinite(self.amplitude)) and np.all(self.amplitude >= 0)):
             raise InputError("A point's amplitude is negative or not finite.", limit=0.0)
+        if np.any(self.amplitude > 0):
+            self._check_places()
+
+    def _check_places(self) -> None:
+        """Refuse points whose light float64 cannot follow: their phases would be noise, and nothing would say so."""
+        for what, unit, value, least, most in (
+            ("tangent", "", float(np.abs(self.field_tan).max()), 0.0, _WIDEST_TAN),
+            ("initial phase", " rad", float(np.abs(self.phase_rad).max()), 0.0, _LARGEST_PHASE),
+            ("distance", " m", float(self.distance_m.min()), _NEAREST_M, np.inf),
+        ):
+            if not least <= value <= most:
+                limit = most if value > most else least
+                raise InputError(
+                    f"A point's {what} is {value:.3g}{unit}; the limit is {limit:.3g}{unit}.",
+                    fix="Remove it from the scene.",
+                    measured=value,
+                    limit=limit,
+                )
 
     def __len__(self) -> int:
         return len(self.amplitude)

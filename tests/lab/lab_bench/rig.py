@@ -1,9 +1,11 @@
-"""A small bench made of arrays: the picture follows the levels, and a fault can be switched on."""
+"""A small bench made of arrays: the picture follows the levels, a fault can be switched on, and a diary is kept."""
 
 from __future__ import annotations
 
 import hashlib
 import time
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,11 +19,23 @@ FULL_SCALE = 4095
 COUNTS_PER_SECOND = 1.0e5  # of a lit pixel: half of full scale at 20 ms
 
 
+class Diary:
+    """What was done to the bench, a word per line in a file that outlives the process; nothing without a file."""
+
+    def __init__(self, path: str) -> None:
+        self.path = Path(path) if path else None
+
+    def note(self, word: str) -> None:
+        if self.path is not None:
+            with self.path.open("a") as file:
+                file.write(f"{word}\n")
+
+
 class Panel:
     """An SLM that shows what it is told, unless it is frozen."""
 
-    def __init__(self, facts: SlmFacts, fault: str) -> None:
-        self.facts, self.fault = facts, fault
+    def __init__(self, facts: SlmFacts, fault: str, diary: Diary) -> None:
+        self.facts, self.fault, self.diary = facts, fault, diary
         self.levels: NDArray[np.uint8] = np.zeros((facts.height, facts.width), np.uint8)
         self.blanked = 0
 
@@ -29,12 +43,14 @@ class Panel:
         return self.facts
 
     def show(self, levels: NDArray[np.uint8]) -> Shown:
+        self.diary.note("show")
         if self.fault != "frozen-panel":
             self.levels = levels.copy()
         read_back = None if self.fault != "read-back" else False
         return Shown(hashlib.sha256(levels.tobytes()).hexdigest(), read_back)
 
     def blank(self) -> None:
+        self.diary.note("blank")
         self.levels = np.zeros_like(self.levels)
         self.blanked += 1
 
@@ -42,18 +58,21 @@ class Panel:
 class Lamp:
     """A light with one line."""
 
-    def __init__(self) -> None:
+    def __init__(self, diary: Diary) -> None:
         self.lit = False
         self.history: list[bool] = []
+        self.diary = diary
 
     def select(self, wavelength_m: float) -> None:
         pass
 
     def on(self) -> None:
+        self.diary.note("on")
         self.lit = True
         self.history.append(True)
 
     def off(self) -> None:
+        self.diary.note("off")
         self.lit = False
         self.history.append(False)
 
@@ -77,6 +96,7 @@ class Eye:
 
     def grab(self) -> Frame:
         self.grabs += 1
+        self.lamp.diary.note("grab")
         time.sleep(self.faults["slow_s"])
         kind = self.faults["kind"] if self.grabs >= self.faults["at"] else "none"
         if kind == "unplugged":
@@ -128,10 +148,15 @@ class LabRig:
             eye_relief_m=12e-3,
             simulated=faults["simulated"],
         )
-        self.slm = Panel(self._facts.slm, faults["kind"])
-        self.light = Lamp()
+        diary = Diary(faults["diary"])
+        self.slm = Panel(self._facts.slm, faults["kind"], diary)
+        self.light = Lamp(diary)
         self.camera = Eye(self._facts.camera, self.slm, self.light, faults)
         self.closed = False
+        if faults["lit_when_opened"]:
+            self.light.on()
+        diary.note("open")
+        time.sleep(faults["slow_open_s"])
 
     def facts(self) -> RigFacts:
         return self._facts
@@ -150,3 +175,21 @@ class LabRig:
 
 def open_rig(config: RigConfig) -> LabRig:
     return LabRig(config)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A device that answered; its handle is nothing to print."""
+
+    model: str
+    serial: str
+    handle: object = field(repr=False, default=None)
+
+
+def discover() -> list[Seen | dict[str, Any]]:
+    """Devices as dataclasses or as mappings: either will do."""
+    return [Seen("eye", "CAM-1", object()), {"model": "panel", "output": "HDMI-2", "width": 1920}]
+
+
+def discover_without_card() -> list[Seen]:
+    raise OSError("no network card")
