@@ -100,7 +100,7 @@ def conclusion(state: State, fresh: Fringes) -> Conclusion:
     phase = table.phase_rad.astype(np.float32)[None]
     return Conclusion(
         before={"phase_error_rms_rad": before, "range_rad": float(state.in_force[-1] - state.in_force[0])},
-        after={"phase_error_rms_rad": check.rms_rad, "range_rad": table.range_rad},
+        after={"phase_error_rms_rad": check.rms_rad, "range_rad": table.range_rad if table.valid else None},
         targets={"phase_error_rms_rad": chosen.target_rad},
         targets_met=met,
         sentence=sentence,

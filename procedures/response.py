@@ -337,8 +337,11 @@ def _with_levels(state: State, frames: Sequence[Frame]) -> State:
         whole = np.mean([np.sum(frame.counts - dark.astype(np.float64)) / frame.exposure_s for frame in frames])
         empty = np.zeros((0, len(pixels)), np.float32)
         state = replace(state, dark=dark, pixels=pixels, light=empty, light_per_s=float(whole))
+    # What the runner halved because it clipped stays halved: the steps to come do not clip anew.
+    used_s = min(frame.exposure_s for frame in frames)
+    state = replace(state, exposure_s=used_s, light=state.light * np.float32(used_s / state.exposure_s))
     assert state.dark is not None
-    taken = light_of(frames, state.dark, state.pixels, camera=camera, exposure_s=state.exposure_s)
+    taken = light_of(frames, state.dark, state.pixels, camera=camera, exposure_s=used_s)
     state = replace(
         state,
         step=state.step + 1,

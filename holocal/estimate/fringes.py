@@ -29,6 +29,8 @@ FEWEST_PIXELS = 12
 LEAST_FRINGE = 5.0  # standard errors by which the weaker of the two fringe components must stand out
 MOST_ITERATIONS = 30
 SMALL_STEP_RAD = 1e-5
+ROUNDING_VAR = 1 / 12  # squared counts
+RIDGE = 1e-10  # of a normal matrix's trace: keeps it positive where phases fill a small arc
 
 
 @dataclass(frozen=True)
@@ -39,9 +41,8 @@ class Noise:
     per_count: float
 
     def variance(self, counts: Array) -> Array:
-        """Return the variance of counts; never below a quarter of the read noise's, whatever a model says."""
-        floor = max(0.25 * self.read_var, 1e-6)
-        return np.asarray(np.maximum(self.read_var + self.per_count * counts, floor))
+        """Return the variance of counts; never below that of rounding to whole counts, whatever a model says."""
+        return np.asarray(np.maximum(self.read_var + self.per_count * np.maximum(counts, 0.0), ROUNDING_VAR))
 
 
 @dataclass(frozen=True)
@@ -207,14 +208,12 @@ def _refined(
     held[k - 1 :, k - 1 :] = prior
     weight = 1 / noise.variance(counts.mean(axis=0) * np.ones((frames, 1)))
     for iteration in range(MOST_ITERATIONS):
-        basis = _basis(phase[which], log_gain)
-        hessian, gradient, residual, model = _profiled(counts, basis, weight)
-        information = spread.T @ hessian @ spread + held
-        pull = spread.T @ gradient
-        pull[k - 1 :] -= prior @ log_gain
         try:
-            covariance = np.linalg.inv(information)
-        except np.linalg.LinAlgError:
+            hessian, gradient, residual, model = _profiled(counts, _basis(phase[which], log_gain), weight)
+            pull = spread.T @ gradient
+            pull[k - 1 :] -= prior @ log_gain
+            covariance = np.linalg.inv(spread.T @ hessian @ spread + held)
+        except np.linalg.LinAlgError:  # phases that have run together: no circle is left to tell fringes by
             return None
         step = covariance @ pull
         step *= min(1.0, 0.5 / float(np.abs(step).max() + 1e-300))
@@ -242,7 +241,7 @@ def _basis(phase: Array, log_gain: Array) -> Array:
 def _pixels(counts: Array, basis: Array, weight: Array) -> tuple[Array, Array]:
     """Return every pixel's fringe (3, n), and the inverse (n, 3, 3) of its normal matrix."""
     normal = np.einsum("fi,fp,fj->pij", basis, weight, basis, optimize=True)
-    inverse = np.linalg.inv(normal + 1e-12 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3))
+    inverse = np.linalg.inv(normal + RIDGE * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3))
     return np.asarray(np.einsum("pij,jp->ip", inverse, basis.T @ (weight * counts))), np.asarray(inverse)
 
 

@@ -12,6 +12,7 @@ from holocal.estimate.fringes import UNKNOWN_RAD
 from holocal.estimate.response import nominal_table, phase_difference, rms
 from holocal.hologram.frame import phase_to_levels
 from holocal.loop.checkpoint import state_bytes, state_from_bytes
+from holocal.loop.devices import Frame
 from holocal.loop.procedure import Outcome
 from holocal.loop.record import RunRecord
 from holocal.loop.runner import run
@@ -226,6 +227,23 @@ def test_a_panel_that_does_nothing_gives_no_table_and_says_so(tmp_path):
     assert done.result["after"]["phase_error_rms_rad"] == UNKNOWN_RAD
     assert not done.result["response"]["valid"]
     assert done.result["sentence"].startswith("no phase response: ")
+
+
+def test_an_exposure_that_the_runner_halved_stays_halved(short):
+    _, procedure, _ = short
+    state = procedure.start(procedure.state.facts, {}, Parameters(), 1)
+    state = replace(state, exposure_s=0.02)
+    rng = np.random.default_rng(0)
+    shown = (None, *levels_of_step(state))
+    light = rng.exponential(600, (128, 128)) * (1 + 0.8 * np.cos(rng.uniform(0, 6, (128, 128))))
+    frames = tuple(
+        Frame(rng.poisson(0.5 * light * (level is not None) + 20).astype(np.uint16), 0.01, i, 0.0)
+        for i, level in enumerate(shown)
+    )
+    found = procedure.update(state, frames)
+    assert found.exposure_s == 0.01
+    assert next(iter(procedure.stimuli(found))).exposure_s == 0.01
+    assert found.shown == shown[1:]
 
 
 def test_a_panel_of_four_levels_is_refused_before_the_first_frame():

@@ -193,3 +193,17 @@ def test_the_noise_is_read_from_repeats(read, slope_error):
     # is known to 1 %, and to 7 % under a read noise of four times the shot noise
     assert found.per_count == pytest.approx(PER_COUNT, rel=slope_error)
     assert found.read_var == pytest.approx(read**2, rel=0.1, abs=6.0)  # what is left at no light: 1 % of 134 + read^2
+
+
+def test_frames_that_follow_no_fringe_at_all_end_without_an_error_or_are_owned_up_to():
+    """A panel whose pixels blur each other shows several phases at once: the frames leave the cone."""
+    table, shown = TABLES["short and bent"], sequence(0)
+    for seed in range(4):
+        rng = generator(seed)
+        a, b, c = (_speckle(rng, 400) for _ in range(3))
+        phase = table[shown][:, None, None]
+        light = np.mean(abs(a + b * np.exp(1j * phase) + c * np.exp(0.4j * phase)) ** 2, axis=1)
+        found = fitted(np.rint(rng.poisson(200 * light) * PER_COUNT), shown)
+        assert np.all(np.isfinite(found.phase_rad)) and np.all(np.isfinite(found.covariance))
+        # 400 pixels x 38 degrees of freedom know chi2 to 1 %; the covariance is larger by it
+        assert not found.valid or found.chi2 > 1.5
