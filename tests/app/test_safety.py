@@ -85,11 +85,11 @@ def test_a_signal_leaves_the_bench_dark_and_exits_130(workplace, name, number):
 
 
 def test_an_interrupted_run_is_resumed_and_a_second_signal_does_not_wait_for_the_step(holocal, workplace):
-    process = begun(workplace, COMMANDS["run"], "--set", "faults.slow_s=1.5")
-    wait_for(workplace, "grab", 14)  # the second of the run begins, 1.5 s long
+    process = begun(workplace, COMMANDS["run"], "--set", "faults.slow_s=0.5")
+    wait_for(workplace, "grab", 14)  # the first of the run begins, 0.5 s long
     for _ in range(2):
         process.send_signal(signal.SIGINT)
-        time.sleep(0.3)
+        time.sleep(0.1)
     asked = time.monotonic()
     process.communicate(timeout=60)
     grabs = diary(workplace).count("grab")
