@@ -25,12 +25,14 @@ from holocal.records import plugins
 from holocal.records.facts import CameraFacts, RigFacts
 from holocal.records.rig import RigConfig
 from holocal.records.rig_model import Table, WavelengthNm
+from holocal.records.safety import SafetyTable
 from holocal.records.validate import validated
 from rigs.context import DriverContext
 from rigs.mounting import MountedCamera, MountedSlm, Mounting
 
 LOGGER = logging.getLogger("holocal.rigs")
 MM, NM = 1e-3, 1e-9
+LONGEST_S = 1.0  # of any exposure, where the file's [safety] names no other
 EXPOSURE_EXCESS = 1.01  # a camera rounds an exposure up to its own step, a line's time: 0.1 % of a millisecond or so
 
 
@@ -60,12 +62,6 @@ class BenchOptics(Table):
     wavelengths_nm: tuple[WavelengthNm, ...] = Field(min_length=1, max_length=16)
     pupil_mm: float = Field(default=3.0, gt=0.0, le=20.0)
     eye_relief_mm: float = Field(default=12.0, gt=0.0, le=100.0)
-
-
-class SafetyTable(Table):
-    """``[safety]``: the longest exposure that any run may use, whatever the camera can do."""
-
-    max_exposure_s: float = Field(default=1.0, gt=0.0, le=3600.0)
 
 
 class DevicesFile(Table):
@@ -227,7 +223,7 @@ def _facts(config: RigConfig, file: DevicesFile, slm: Slm, light: Light, camera:
     return RigFacts(
         name=config.name,
         slm=slm.describe(),
-        camera=LimitedCamera(camera, file.safety.max_exposure_s).describe(),
+        camera=LimitedCamera(camera, file.safety.max_exposure_s or LONGEST_S).describe(),
         wavelengths_m=tuple(line * NM for line in file.optics.wavelengths_nm),
         pupil_diameter_m=file.optics.pupil_mm * MM,
         eye_relief_m=file.optics.eye_relief_mm * MM,
