@@ -288,13 +288,11 @@ class Response:
 
     def against_truth(self, conclusion: Conclusion, truth: Mapping[str, Any]) -> dict[str, float]:
         """Return the error of the table against a simulated rig's own, piston taken out, for `result.json` alone."""
-        if "response_rad" not in truth:
+        own = truth.get("response_rad", {}).get(f"{conclusion.extra['wavelength_nm']:g}")
+        if own is None:
             return {}
-        return {
-            "phase_error_rms_rad": rms(
-                phase_difference(conclusion.extra["response"]["phase_rad"], truth["response_rad"])
-            )
-        }
+        found = conclusion.extra["response"]["phase_rad"]
+        return {"phase_error_rms_rad": rms(phase_difference(found, own))}
 
 
 def _shot(

@@ -24,14 +24,14 @@ import torch
 from numpy.typing import NDArray
 
 from holocal.optics.bench import Array, Bench, Panel
-from holocal.optics.raytrace import trace_to_pupil
-from rigs.simulated.kernel import Box, PatchKernel, PathTable, Polynomial, fit_patch, interpolate
+from rigs.simulated.kernel import Box, PatchKernel, PathTable, Polynomial, fit_patch
 from rigs.simulated.pupil import Complex, PupilGrid, unit_phase
 from rigs.simulated.resample import TAPS, Resampling, add_piece, transposed
+from rigs.simulated.stencil import Factors, Stencil, apply, fit_stencil
 
-NUFFT_EPS = 1e-3  # relative, each patch; the phase model's 0.008 rad is the larger error
-PATCH_PX = (256, 240)  # patch in the panel's middle, columns and rows, for a phase error of 0.008 rad rms
-# The mirror is nearer to +x directions: there patches are narrower, else they leave 0.023 rad and those at -x 0.004.
+NUFFT_EPS = 1e-3  # relative, each patch; the phase model's 0.002 rad is the larger error
+PATCH_PX = (384, 360)  # patch in the panel's middle, columns and rows, for a phase error of 0.002 rad rms
+# The mirror is nearer to +x directions: there patches are narrower, else their errors are five times those at -x.
 PATCH_SLOPE_PER_M = 60.0
 # A line's pieces hold, beside the patch's own light, the bend of its wave against the middle patch's. Six patches: half
 # the samples of a line of seventeen, and little more to add up.
@@ -40,12 +40,13 @@ LINE_PATCHES = 6
 
 @dataclass(frozen=True)
 class _Place:
-    """A patch: which pixels, its phase model, its coarse columns, the wave of the patch in the middle of its line."""
+    """A patch: its pixels, phase model, coarse columns, and the wave of the patch in the middle of its line."""
 
     rows: slice
     columns: slice
     kernel: PatchKernel
     across: Resampling
+    stencil: Stencil
     reference: Polynomial
 
 
@@ -54,10 +55,11 @@ class _Patch:
     plan: Any
     rows: slice
     columns: slice
-    phase: Complex  # illumination and alpha over the patch
-    weight: Complex  # at the needed coarse points: filter of the pixel's active square, amplitude, rest of the carrier
+    phase: Complex  # illumination, alpha and amplitude over the patch
     needed: NDArray[np.intp]  # which of the coarse points (columns, rows), flat
-    shape: tuple[int, int]  # of the coarse points
+    first: Factors  # of the stencil, at the inner coarse points
+    second: Factors
+    weight: Complex  # at the coarse points: the amplitude's other factor, and the rest of the carrier
 
 
 class PanelToPupil:
@@ -87,8 +89,8 @@ class PanelToPupil:
     ----------
     grid
         The pupil's grid, and the mean wave that the field is stored without.
-    residual_rad
-        Rms of the phase that the patches' separable form leaves, mean over patches.
+    residual
+        Relative rms error of the field that the patches' form and its stencil leave, mean over patches.
     """
 
     def __init__(
@@ -103,6 +105,7 @@ class PanelToPupil:
         patch_px: tuple[int, int] = PATCH_PX,
     ) -> None:
         self.panel, self.wavelength_m, self.fill_factor = panel, wavelength_m, fill_factor
+        self._illumination = illumination
         self.radius_m = (bench.pupil_diameter_m + pupil_edge_m) / 2  # outside of it no light passes
         half_x, half_y = panel.half_size_m
         reach = self.radius_m * 1.005
@@ -115,15 +118,12 @@ class PanelToPupil:
         cells = [[(r, c) for c in group] for r in rows for group in _groups(columns, LINE_PATCHES)]
         boxes = [self._box(*cell) for line in cells for cell in line]
         kernels = list(self._pool.map(lambda box: fit_patch(table, box, wavelength_m), boxes))
-        self.residual_rad = float(np.mean([kernel.residual_rad for kernel in kernels]))
         fitted = iter(kernels)
         lines = self._plan_coarse_grids([[(*cell, next(fitted)) for cell in line] for line in cells])
         self._places = [place for line in lines for place in line]
-        self._patches: list[Future[_Patch]] = [
-            self._pool.submit(self._plan_patch, place, illumination) for place in self._places
-        ]
+        self.residual = float(np.mean([place.stencil.residual for place in self._places]))
+        self._patches: list[Future[_Patch]] = [self._pool.submit(self._plan_patch, place) for place in self._places]
         self._plan_sums(lines)
-        self._dead = fill_factor is not None and fill_factor < 1 and self._order_in_reach(bench)
         self._unmodulated: torch.Tensor | None = None
 
     def _box(self, rows: slice, columns: slice) -> Box:
@@ -137,12 +137,15 @@ class PanelToPupil:
             [self._bandwidth(kernel, kernel.beta - reference) for _, _, kernel in line]
             for line, reference in zip(lines, references, strict=True)
         ]
-        self._down = Resampling.of(self.grid.y_m, 2 * np.pi / max(band[1] for line in bands for band in line))
+        self._down = down = Resampling.of(self.grid.y_m, 2 * np.pi / max(band[1] for line in bands for band in line))
+
+        def place(rows: slice, columns: slice, kernel: PatchKernel, band: float, reference: Polynomial) -> _Place:
+            across = Resampling.of(self.grid.x_m, 2 * np.pi / band)
+            stencil = fit_stencil(kernel, self._amplitude(kernel, dead=False), (across.pitch_m, down.pitch_m))
+            return _Place(rows, columns, kernel, across, stencil, reference)
+
         return [
-            [
-                _Place(rows, columns, kernel, Resampling.of(self.grid.x_m, 2 * np.pi / band[0]), reference)
-                for (rows, columns, kernel), band in zip(line, line_bands, strict=True)
-            ]
+            [place(*cell, band[0], reference) for cell, band in zip(line, line_bands, strict=True)]
             for line, line_bands, reference in zip(lines, bands, references, strict=True)
         ]
 
@@ -184,74 +187,71 @@ class PanelToPupil:
         mean = 2 * np.pi / self.wavelength_m * self.grid.mean_path_m(fine_x[None], fine_y[:, None])
         self._common = torch.from_numpy(unit_phase(common.on_grid(fine_x, fine_y) + mean) * self.transmission)
 
-    def _plan_patch(self, place: _Place, illumination: NDArray[np.float32] | Complex | None) -> _Patch:
+    def _plan_patch(self, place: _Place) -> _Patch:
         import finufft
 
-        kernel, rows, columns = place.kernel, place.rows, place.columns
-        x, y = self.panel.x_m[columns], self.panel.y_m[rows]
-        coarse_x, coarse_y = place.across.coarse_m, self._down.coarse_m
-        margin = TAPS / 2 * max(place.across.pitch_m, self._down.pitch_m)
-        needed = np.flatnonzero(np.hypot(coarse_x[:, None], coarse_y[None]) <= self.radius_m + margin)
-
-        def at_coarse(values: Array) -> NDArray[np.float32]:
-            return np.ascontiguousarray(values.T, np.float32).ravel()[needed]
-
-        # The patch's grid of 200 x 200 stays in the cache: sorting its points costs more than it saves.
+        kernel = place.kernel
+        x, y = self.panel.x_m[place.columns], self.panel.y_m[place.rows]
+        coarse = place.across.coarse_m, self._down.coarse_m
+        margin = (TAPS / 2 + 1) * max(place.across.pitch_m, self._down.pitch_m)
+        needed = np.flatnonzero(np.hypot(coarse[0][:, None], coarse[1][None]) <= self.radius_m + margin)
+        # The patch's grid of 250 x 250 stays in the cache: sorting its points costs more than it saves.
         plan = finufft.Plan(3, 2, eps=NUFFT_EPS, isign=1, dtype="complex64", nthreads=1, spread_sort=0)
         plan.setpts(
             *(np.ascontiguousarray(g.on_grid(x, y).ravel(), dtype=np.float32) for g in (kernel.gx, kernel.gy)),
             None,
-            *(at_coarse(u.on_grid(coarse_x, coarse_y)) for u in (kernel.ux, kernel.uy)),
+            *(_turned(u, coarse).ravel()[needed] for u in (kernel.ux, kernel.uy)),
         )
-        _, tilt_per_m = self.panel.illumination_frequency_per_m
-        phase = unit_phase(kernel.alpha.on_grid(x, y) + 2 * np.pi * tilt_per_m * y[:, None])
-        if illumination is not None:
-            phase = phase * illumination[rows, columns]
-        rest = unit_phase(_rest(kernel.beta - place.reference, coarse_x, coarse_y, axis=1).T).ravel()[needed]
-        weight = rest * at_coarse(self._amplitude(kernel, dead=False).on_grid(coarse_x, coarse_y))
-        return _Patch(plan, rows, columns, phase, weight, needed, (len(coarse_x), len(coarse_y)))
+        return self._patch(place, place.stencil, plan, needed)
 
-    def _amplitude(self, kernel: PatchKernel, *, dead: bool) -> Polynomial:
+    def _patch(self, place: _Place, stencil: Stencil, plan: Any, needed: NDArray[np.intp]) -> _Patch:
+        rows, columns = place.rows, place.columns
+        x, y = self.panel.x_m[columns], self.panel.y_m[rows]
+        _, tilt_per_m = self.panel.illumination_frequency_per_m
+        phase = unit_phase(place.kernel.alpha.on_grid(x, y) + 2 * np.pi * tilt_per_m * y[:, None])
+        phase *= stencil.from_panel.on_grid(x, y).astype(np.float32)
+        if self._illumination is not None:
+            phase *= self._illumination[rows, columns]
+        coarse = place.across.coarse_m, self._down.coarse_m
+        rest = _rest(place.kernel.beta - place.reference, *coarse, axis=1)
+        weight = unit_phase((rest + stencil.constant.on_grid(*coarse)).T)
+        weight *= _turned(stencil.to_pupil, coarse)
+        first, second = (
+            tuple(np.ascontiguousarray(_turned(part, coarse)[1:-1, 1:-1]) for part in parts)
+            for parts in (stencil.first, stencil.second)
+        )
+        return _Patch(plan, rows, columns, phase, needed, first, second, weight)
+
+    def _amplitude(self, kernel: PatchKernel, *, dead: bool) -> Array:
         """Return what a pixel's active square, or its dead frame, sends to the pupil, per unit amplitude on the panel.
 
-        An aperture of side a turns light of frequency f_in into f_out with sinc(a (f_out - f_in)) per axis.
+        An aperture of side a turns light of frequency f_in into f_out with sinc(a (f_out - f_in)) per axis. The values
+        are at the nodes of patch and pupil.
         """
-        pupil = kernel.amplitude.box
-        nodes = pupil.nodes(kernel.amplitude.coefficients.shape[0])
         pitch = self.panel.pitch_m
-        amplitude = kernel.amplitude.on_grid(*nodes) * (pitch**2 / self.wavelength_m)
-        if self.fill_factor is not None:
-            fx_in, fy_in = self.panel.illumination_frequency_per_m
-            side = pitch * np.sqrt(self.fill_factor)
-            fx, fy = kernel.fx.on_grid(*nodes) - fx_in, kernel.fy.on_grid(*nodes) - fy_in
-            active = self.fill_factor * np.sinc(side * fx) * np.sinc(side * fy)
-            amplitude *= np.sinc(pitch * fx) * np.sinc(pitch * fy) - active if dead else active
-        return interpolate(pupil, amplitude)
+        amplitude = kernel.amplitude * (pitch**2 / self.wavelength_m)
+        if self.fill_factor is None:
+            return amplitude
+        fx_in, fy_in = self.panel.illumination_frequency_per_m
+        side = pitch * np.sqrt(self.fill_factor)
+        fx, fy = kernel.fx - fx_in, kernel.fy - fy_in
+        active = self.fill_factor * np.sinc(side * fx) * np.sinc(side * fy)
+        return np.asarray(amplitude * (np.sinc(pitch * fx) * np.sinc(pitch * fy) - active if dead else active))
 
     def _dead_space(self, patches: list[_Patch]) -> torch.Tensor:
         """Return the field in the pupil of the light that the frames between the pixels send, unmodulated.
 
-        It comes to a focus, a millimetre wide at most, at the diffraction orders of the pixels: where all of these lie
-        outside of the pupil by more than that, there is none (what strays in is below 1e-4 of the signal).
+        It comes to a focus, a millimetre wide at most, at the diffraction orders of the pixels. On the thesis's bench
+        the nearest lies 1.8 mm outside of the pupil's rim, and what strays in is 0.3 % of the field.
         """
 
         def piece(job: tuple[_Patch, _Place]) -> torch.Tensor:
-            (patch, place), across = job, job[1].across
-            dead, active = (
-                self._amplitude(place.kernel, dead=part).on_grid(across.coarse_m, self._down.coarse_m).T.ravel()
-                for part in (True, False)
-            )
-            return _piece(patch, None, (dead[patch.needed] / active[patch.needed]).astype(np.float32))
+            patch, place = job
+            step = place.across.pitch_m, self._down.pitch_m
+            stencil = fit_stencil(place.kernel, self._amplitude(place.kernel, dead=True), step)
+            return _piece(self._patch(place, stencil, patch.plan, patch.needed), None)
 
         return self._sum(list(self._pool.map(piece, zip(patches, self._places, strict=True))))
-
-    def _order_in_reach(self, bench: Bench) -> bool:
-        """Return whether a diffraction order of the panel's middle lands within a millimetre of the pupil."""
-        order = np.stack(np.meshgrid([-1, 0, 1], [-2, -1, 0, 1]), axis=-1).reshape(-1, 2) / self.panel.pitch_m
-        sines = self.wavelength_m * (order + np.array(self.panel.illumination_frequency_per_m))
-        along = np.sqrt(np.maximum(1 - np.sum(sines**2, axis=1, keepdims=True), 0))
-        rays = trace_to_pupil(bench, np.zeros((len(sines), 2)), np.concatenate([sines, along], axis=1))
-        return bool(np.any(rays.valid & (np.linalg.norm(rays.landing_m, axis=1) < self.radius_m + 1e-3)))
 
     def field(self, modulation: Complex) -> Complex:
         """Return the field inside the pupil, (rows, columns) complex64 on `grid`, of a (height, width) modulation.
@@ -261,7 +261,7 @@ class PanelToPupil:
         panel pixel of modulus 1.
         """
         patches = [patch.result() for patch in self._patches]
-        if self._dead and self._unmodulated is None:
+        if self._unmodulated is None and self.fill_factor is not None and self.fill_factor < 1:
             self._unmodulated = self._dead_space(patches)
         field = self._sum(list(self._pool.map(lambda patch: _piece(patch, modulation), patches)))
         if self._unmodulated is not None:
@@ -281,13 +281,13 @@ class PanelToPupil:
         return total[:n_y].mul_(self._common)
 
 
-def _piece(patch: _Patch, modulation: Complex | None, factor: NDArray[np.float32] | None = None) -> torch.Tensor:
+def _piece(patch: _Patch, modulation: Complex | None) -> torch.Tensor:
     """Return a patch's field at its coarse points, (columns, rows), 0 where it is not needed."""
     source = patch.phase if modulation is None else modulation[patch.rows, patch.columns] * patch.phase
-    values = patch.plan.execute(source.ravel())
-    values *= patch.weight if factor is None else patch.weight * factor
-    piece = np.zeros(patch.shape, np.complex64)
-    piece.ravel()[patch.needed] = values
+    piece = np.zeros(patch.weight.shape, np.complex64)
+    piece.ravel()[patch.needed] = patch.plan.execute(source.ravel())
+    apply(piece, patch.first, patch.second)
+    piece *= patch.weight
     return torch.from_numpy(piece)
 
 
@@ -317,3 +317,8 @@ def _rest(phase: Polynomial, x: Array, y: Array, *, axis: int) -> Array:
     if axis == 1:
         return phase.on_grid(x, y) - _along(phase, x, axis=1)[None]
     return phase.on_grid(x, y) - _along(phase, y, axis=0)[:, None]
+
+
+def _turned(values: Polynomial, coarse: tuple[Array, Array]) -> NDArray[np.float32]:
+    """Return a polynomial at coarse points, (columns, rows)."""
+    return np.ascontiguousarray(values.on_grid(*coarse).T, np.float32)

@@ -1,10 +1,11 @@
 """The wave's phase between a patch of the panel and the pupil, as polynomials.
 
 From the panel point x to the pupil point q the light's phase is k L(x, q), with L the length of the traced ray. Over a
-small patch of the panel it is, to about 0.01 rad (rms, 256 x 240 pixels, whole pupil), the sum of a function of x, one
+small patch of the panel it is, to about 0.02 rad (rms, 384 x 360 pixels, whole pupil), the sum of a function of x, one
 of q, and two products u(q) g(x). The four are found from the ray trace by a singular value decomposition, so nothing
 here knows how the hologram engine thinks of the same bench: that one works between panel and field, this one between
 panel and pupil, where the pupil is an exact mask.
+What is left of it `stencil` makes up for.
 """
 
 from __future__ import annotations
@@ -57,6 +58,13 @@ class Polynomial:
         basis_x = chebyshev.chebvander(nx, order_x - 1)
         return np.asarray(basis_y @ self.coefficients @ basis_x.T)
 
+    def gradient(self, x: Array, y: Array) -> tuple[Array, Array]:
+        """Return its derivatives along x and along y, (len(y), len(x)) each, on the product grid of x and y."""
+        across, down = (np.asarray(chebyshev.chebder(self.coefficients, axis=i), np.float64) for i in (1, 0))
+        along_x = Polynomial(self.box, across * (2 / (self.box.x1 - self.box.x0)))
+        along_y = Polynomial(self.box, down * (2 / (self.box.y1 - self.box.y0)))
+        return along_x.on_grid(x, y), along_y.on_grid(x, y)
+
     def __sub__(self, other: Polynomial) -> Polynomial:
         return Polynomial(self.box, self.coefficients - other.coefficients)
 
@@ -74,8 +82,9 @@ class PatchKernel:
     """Phase k L(x, q) = alpha(x) + beta(q) + u(q) . g(x), radians, over one patch; `residual_rad`: what it leaves, rms.
 
     `alpha`, `gx`, `gy` are polynomials over the patch (`g` in metres, close to x - patch centre), `beta`, `ux`, `uy`
-    (u in radians per metre) over the pupil, `amplitude` the square root of |det d2L/dx dq| (per metre) at the patch's
-    centre, `fx`, `fy` the spatial frequencies (cycles per metre) of the light that leaves the patch's centre for q.
+    (u in radians per metre) over the pupil. At the nodes of both, (panel nodes, pupil nodes): `rest_rad` is what the
+    form leaves, `amplitude` the square root of |det d2L/dx dq| (per metre), `fx` and `fy` the spatial frequencies
+    (cycles per metre) of the light that leaves x for q.
     """
 
     alpha: Polynomial
@@ -84,9 +93,10 @@ class PatchKernel:
     beta: Polynomial
     ux: Polynomial
     uy: Polynomial
-    amplitude: Polynomial
-    fx: Polynomial
-    fy: Polynomial
+    amplitude: Array
+    fx: Array
+    fy: Array
+    rest_rad: Array
     residual_rad: float
 
 
@@ -145,32 +155,26 @@ def fit_patch(table: PathTable, patch: Box, wavelength_m: float) -> PatchKernel:
     """Return the phase between a patch of the panel (S) and the pupil (P) in its separable form."""
     pupil, k = table.pupil, 2 * np.pi / wavelength_m
     nodes_x, nodes_y = patch.nodes(X_NODES)
-    x, q = _grid(patch, X_NODES), _grid(pupil, Q_NODES)
-    middle_x, middle_y = np.array([x[:, 0].mean()]), np.array([x[:, 1].mean()])
+    x = _grid(patch, X_NODES)
     phase = k * table.at(table.path_m, nodes_x, nodes_y)
-    # Weights: Chebyshev nodes crowd at the edges, and only the disc of the pupil counts.
-    weight_x = _uniform(X_NODES)
-    weight_q = _uniform(Q_NODES) * np.where(np.hypot(*q.T) <= 1.02 * pupil.x1, 1.0, 1e-3)
-    weight_x, weight_q = weight_x / weight_x.sum(), weight_q / weight_q.sum()
+    weight_x, weight_q = panel_weight(), pupil_weight(pupil)
     alpha = phase @ weight_q
     beta = weight_x @ (phase - alpha[:, None])
     rest = phase - alpha[:, None] - beta[None]
     left = np.linalg.svd(np.sqrt(weight_x)[:, None] * rest * np.sqrt(weight_q), full_matrices=False)[0][:, :2]
     left = left / np.sqrt(weight_x)[:, None]
     # The decomposition leaves a free 2 x 2 matrix between u and g: fix it so that g is as near to x as it can be.
-    g = left @ np.linalg.lstsq(left, x - [middle_x[0], middle_y[0]], rcond=None)[0]
+    g = left @ np.linalg.lstsq(left, x - x.mean(axis=0), rcond=None)[0]
     root = np.sqrt(weight_x)[:, None]
     u = np.linalg.lstsq(root * g, root * rest, rcond=None)[0]
-    residual = float(np.sqrt(weight_x @ (rest - g @ u) ** 2 @ weight_q))
+    left_over = rest - g @ u
+    residual = float(np.sqrt(weight_x @ left_over**2 @ weight_q))
 
     def over_patch(values: Array) -> Polynomial:
         return interpolate(patch, values.reshape(X_NODES, X_NODES))
 
     def over_pupil(values: Array) -> Polynomial:
         return interpolate(pupil, values.reshape(Q_NODES, Q_NODES))
-
-    def at_middle(values: Array) -> Array:
-        return np.asarray(table.at(values, middle_x, middle_y)[0])
 
     return PatchKernel(
         alpha=over_patch(alpha),
@@ -179,11 +183,24 @@ def fit_patch(table: PathTable, patch: Box, wavelength_m: float) -> PatchKernel:
         beta=over_pupil(beta),
         ux=over_pupil(u[0]),
         uy=over_pupil(u[1]),
-        amplitude=over_pupil(np.exp(at_middle(table.log_amplitude))),
-        fx=over_pupil(at_middle(table.sin_x) / wavelength_m),
-        fy=over_pupil(at_middle(table.sin_y) / wavelength_m),
+        amplitude=np.exp(table.at(table.log_amplitude, nodes_x, nodes_y)),
+        fx=table.at(table.sin_x, nodes_x, nodes_y) / wavelength_m,
+        fy=table.at(table.sin_y, nodes_x, nodes_y) / wavelength_m,
+        rest_rad=left_over,
         residual_rad=residual,
     )
+
+
+def panel_weight() -> Array:
+    """Return the weights of a patch's nodes in a mean over it: Chebyshev nodes crowd at the edges."""
+    weight = _uniform(X_NODES)
+    return np.asarray(weight / weight.sum())
+
+
+def pupil_weight(pupil: Box) -> Array:
+    """Return the weights of the pupil's nodes in a mean over it: only the disc counts."""
+    weight = _uniform(Q_NODES) * np.where(np.hypot(*_grid(pupil, Q_NODES).T) <= 1.02 * pupil.x1, 1.0, 1e-3)
+    return np.asarray(weight / weight.sum())
 
 
 def _uniform(n: int) -> Array:

@@ -3,125 +3,27 @@
 from __future__ import annotations
 
 import hashlib
-from collections import OrderedDict
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from holocal.errors import ConfigError, DeviceError
 from holocal.loop.devices import Frame, Shown
-from holocal.optics.bench import Bench, Panel, Pose
 from holocal.records.facts import CameraFacts, RigFacts, SlmFacts
 from holocal.records.rig import RigConfig, fingerprint
-from holocal.records.rig_model import SimulatedRig as Tables
-from holocal.units import DEGREE, MM, NM, UM
-from rigs.simulated.aperture import PanelToPupil
-from rigs.simulated.camera import Lens, PupilToPicture
-from rigs.simulated.pupil import Complex, unit_phase
-from rigs.simulated.sensor import Sensor
+from holocal.units import MM, NM, UM
+from rigs.simulated.optics import Optics
+from rigs.simulated.panel import phase_of_levels
+from rigs.simulated.sensor import Sensor, stream
 
 # Photo-electrons per second and square metre of evenly lit panel: a white field of the 4K panel fills a sixth of the
 # well in about 10 ms.
 FLUX_E_PER_S_M2 = 1e15
 EXPOSURE_MIN_S = 3e-5
 LINE_WIDTH_M = 1e-9
-PATTERNS_KEPT = 8  # shown again, they cost only the sensor: a pre-flight goes to and fro between two
-SMALLEST_DEMAGNIFICATION = 1 / 2.7  # of the panel anywhere in the field: 1 / 2.85 on the nominal bench
-
-
-def bench_of(tables: Tables) -> Bench:
-    """Return the true, misaligned bench of a simulated rig's file."""
-    wrong, optics = tables.misalignment, tables.optics
-
-    def pose(rotation_deg: tuple[float, float, float], shift_mm: tuple[float, float, float]) -> Pose:
-        turned, moved = (tuple(v * unit for v in values) for values, unit in ((rotation_deg, DEGREE), (shift_mm, MM)))
-        return Pose(turned, moved)  # type: ignore[arg-type]
-
-    return Bench(
-        pupil_diameter_m=optics.pupil_mm * MM,
-        eye_relief_m=optics.eye_relief_mm * MM,
-        mirror=pose(wrong.mirror_rotation_deg, wrong.mirror_shift_mm),
-        slm=pose(wrong.slm_rotation_deg, wrong.slm_shift_mm),
-    )
-
-
-@dataclass
-class Optics:
-    """The light's way from the panel to the pixels; built when the first frame of a wavelength is asked for."""
-
-    tables: Tables
-    _wavelength_m: float | None = None
-    _to_pupil: PanelToPupil | None = None
-    _to_picture: PupilToPicture | None = None
-    _powers: OrderedDict[tuple[str, float], NDArray[np.float32]] = field(default_factory=OrderedDict)
-
-    @property
-    def panel(self) -> Panel:
-        """The panel's pixels."""
-        slm = self.tables.slm
-        return Panel(slm.width, slm.height, slm.pitch_um * UM)
-
-    @cached_property
-    def lens(self) -> Lens:
-        """The camera's geometry."""
-        camera = self.tables.camera
-        return Lens(
-            camera.width, camera.height, camera.field_deg * DEGREE, camera.rotation_deg * DEGREE, camera.k1, camera.k2
-        )
-
-    def illumination(self) -> NDArray[np.float32] | None:
-        """Return the amplitude of the light on the panel, (height, width), None where it is 1 everywhere."""
-        light = self.tables.illumination
-        if light.profile == "flat":
-            return None
-        waist = light.waist_mm * MM  # of intensity, 1/e^2: the amplitude falls to 1/e there
-        x, y = np.exp(-((self.panel.x_m / waist) ** 2)), np.exp(-((self.panel.y_m / waist) ** 2))
-        return np.asarray(np.outer(y, x), np.float32)
-
-    def modulation(self, levels: NDArray[np.uint8]) -> Complex:
-        """Return what the panel does to the light, (height, width) complex64 of modulus 1."""
-        slm = self.tables.slm
-        steps = 2**slm.bits
-        table = 2 * np.pi * np.arange(steps) / steps if slm.response == "ideal" else np.array(slm.response)
-        if slm.crosstalk_um > 0:  # the fringing field blurs the phase itself, fly-back of a wrap included
-            sigma = slm.crosstalk_um / slm.pitch_um
-            phase = cv2.GaussianBlur(table.astype(np.float32)[levels], (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
-            return unit_phase(phase.astype(np.float64))
-        return unit_phase(table)[levels]
-
-    def power(self, levels: NDArray[np.uint8], sha256: str, wavelength_m: float) -> NDArray[np.float32]:
-        """Return the power on every pixel, (height, width), in square metres of evenly lit panel."""
-        known = self._powers.get((sha256, wavelength_m))
-        if known is None:
-            if self._wavelength_m != wavelength_m:
-                self._build(wavelength_m)
-            assert self._to_pupil is not None
-            assert self._to_picture is not None
-            known = self._to_picture.power(self._to_pupil.field(self.modulation(levels)))
-            self._powers[sha256, wavelength_m] = known
-            if len(self._powers) > PATTERNS_KEPT:
-                self._powers.popitem(last=False)
-        self._powers.move_to_end((sha256, wavelength_m))
-        return known
-
-    def _build(self, wavelength_m: float) -> None:
-        self._to_pupil = self._to_picture = None  # two wavelengths at once would double the memory
-        self._to_pupil = PanelToPupil(
-            bench_of(self.tables),
-            self.panel,
-            wavelength_m,
-            illumination=self.illumination(),
-            fill_factor=self.tables.slm.fill_factor,
-            pupil_edge_m=self.tables.optics.pupil_edge_mm * MM,
-        )
-        half_x, half_y = self.panel.half_size_m
-        reach_m = (SMALLEST_DEMAGNIFICATION * 2 * half_x, SMALLEST_DEMAGNIFICATION * 2 * half_y)
-        self._to_picture = PupilToPicture(self._to_pupil.grid, self.lens, wavelength_m, reach_m=reach_m)
-        self._wavelength_m = wavelength_m
+FLICKER = 0xF11C  # the laser's own stream of random numbers; the sensor's are those of its bands
 
 
 @dataclass
@@ -136,6 +38,12 @@ class _Bench:
     is_open: bool = True
     step: tuple[int, int] = (0, 0)  # the run's seed and step, see begin_step
     grabs: dict[tuple[object, ...], int] = field(default_factory=dict)
+
+    def flicker(self, key: tuple[object, ...]) -> np.float32:
+        """Return the laser's power in a frame, of its mean."""
+        tables = self.optics.tables
+        rms = tables.illumination.power_noise
+        return np.float32(max(0.0, 1 + rms * stream(tables.seed, key, FLICKER).standard_normal()) if rms else 1.0)
 
     def require_open(self) -> None:
         if not self.is_open:
@@ -214,7 +122,8 @@ class SimulatedCamera:
         seen = (bench.sha256, bench.wavelength_m) if bench.light_on else ()
         what = (*bench.step, *seen, bench.light_on, self._exposure_s)
         bench.grabs[what] = bench.grabs.get(what, 0) + 1
-        counts = self._sensor.expose(rate, self._exposure_s, (*what, bench.grabs[what]))
+        key = (*what, bench.grabs[what])
+        counts = self._sensor.expose(rate * bench.flicker(key), self._exposure_s, key)
         self._frame_id += 1
         saturated = float(np.mean(counts >= self._facts.full_scale))
         return Frame(counts, self._exposure_s, self._frame_id, saturated)
@@ -309,10 +218,16 @@ class SimulatedRig:
 
     def truth(self) -> dict[str, Any]:
         """Return what only a simulated rig can know."""
+        slm, camera = self._tables.slm, self._tables.camera
         return {
             "misalignment": self._tables.misalignment.model_dump(mode="json"),
             "illumination": self._tables.illumination.model_dump(mode="json"),
-            "fill_factor": self._tables.slm.fill_factor,
+            "fill_factor": slm.fill_factor,
+            "response_rad": {  # of every level, by line in nm
+                f"{line:g}": phase_of_levels(slm, line * NM).tolist() for line in self._tables.optics.wavelengths_nm
+            },
+            "slm": slm.model_dump(mode="json", include={"crosstalk_um", "flatness_nm"}),
+            "camera": camera.model_dump(mode="json", include={"rotation_deg", "k1", "k2", "focus_m", "pupil_mm"}),
         }
 
     def close(self) -> None:

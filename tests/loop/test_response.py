@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from hashlib import sha256
 
 import numpy as np
 import pytest
@@ -214,7 +215,10 @@ def test_a_panel_that_does_nothing_gives_no_table_and_says_so(tmp_path):
         """The procedure on a panel that shows level 0 whatever it is sent, once the pre-flight is over."""
 
         def start(self, *given):
-            rig._bench.optics.modulation = lambda levels: np.ones(levels.shape, np.complex64)
+            show = rig.slm.show
+            rig.slm.show = lambda levels: replace(
+                show(np.zeros_like(levels)), sha256=sha256(levels.tobytes()).hexdigest()
+            )
             return super().start(*given)
 
     record = RunRecord.create(tmp_path, "response", config="", identity={})
@@ -256,7 +260,7 @@ def test_a_panel_of_four_levels_is_refused_before_the_first_frame():
 def test_the_truth_of_a_simulated_rig_is_held_against_the_table_and_nothing_else(short):
     done, procedure, _ = short
     conclusion = procedure.conclude(procedure.state, procedure.verified)
-    told = procedure.against_truth(conclusion, {"response_rad": (SHORT + 3.0).tolist()})
+    told = procedure.against_truth(conclusion, {"response_rad": {"515": (SHORT + 3.0).tolist()}})
     assert told["phase_error_rms_rad"] == pytest.approx(error_of(done.result, SHORT), rel=1e-6)
     assert procedure.against_truth(conclusion, {"fill_factor": 0.93}) == {}
 
