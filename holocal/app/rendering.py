@@ -123,7 +123,7 @@ def render(config: RigConfig, asked: Request, outputs: Outputs) -> dict[str, Any
     began = time.monotonic()
     scene = scenes.read(asked.scene, srgb=asked.srgb, colour=asked.colour)
     read_s = time.monotonic() - began
-    with session.opened_rig(config) as rig:
+    with session.asked_rig(config) as rig:
         facts = rig.facts()
     in_force = session.corrections(asked.corrections, identity(facts))
     fov_rad = (asked.fov_deg[0] * DEGREE, asked.fov_deg[1] * DEGREE)

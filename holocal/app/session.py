@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -62,6 +62,19 @@ def claimed_rig(config: RigConfig) -> Iterator[Rig]:
     with locked(lock_of(config.name), f"rig {config.name}"), opened_rig(config) as rig, dark_at_the_end(rig):
         guarded(rig.light.off, "the light source")  # a program that was killed may have left it on
         guarded(rig.slm.blank, "the SLM")
+        yield rig
+
+
+@contextmanager
+def asked_rig(config: RigConfig) -> Iterator[Rig]:
+    """Yield a rig that is only asked for its facts; `BusyError` when another process works with the real one.
+
+    Opening real devices makes them dark, in the midst of that process's measurement. A rig that was never claimed has
+    no lock, and none is made: a dry run leaves nothing behind.
+    """
+    lock = lock_of(config.name)
+    claimable = config.kind != "simulated" and lock.is_file()
+    with locked(lock, f"rig {config.name}") if claimable else nullcontext(), opened_rig(config) as rig:
         yield rig
 
 
@@ -144,7 +157,7 @@ def plan(procedure_name: str, rig: RigConfig, overrides: Mapping[str, Any]) -> d
     values, _ = configuration.parameters(
         procedure.parameters_model, overrides, procedure=procedure_name, device=rig.device
     )
-    with opened_rig(rig) as device:
+    with asked_rig(rig) as device:
         planned = procedure.plan(device.facts(), values)
     return {
         "schema": 1,

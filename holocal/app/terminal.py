@@ -8,7 +8,8 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Mapping
-from typing import Any
+from contextlib import suppress
+from typing import IO, Any, TextIO, cast
 
 from rich.console import Console
 from rich.markup import escape
@@ -22,11 +23,45 @@ from holocal.records.files import dump_json
 LINE = 110  # characters of a line where there is no terminal to ask
 
 
+class _Stderr:
+    """The stderr of now, whose reader may be gone: a terminal that was closed must not make a bug of a run's end."""
+
+    @property
+    def _real(self) -> TextIO:
+        # While a status line is shown, rich puts a proxy in the place of sys.stderr that prints to this console.
+        return cast(TextIO, getattr(sys.stderr, "rich_proxied_file", sys.stderr))
+
+    @property
+    def encoding(self) -> str:
+        """What rich asks to know which characters can be written."""
+        return self._real.encoding
+
+    def isatty(self) -> bool:
+        """Return whether it is a terminal."""
+        return self._real.isatty()
+
+    def fileno(self) -> int:
+        """Return the descriptor, whose width rich asks for."""
+        return self._real.fileno()
+
+    def write(self, text: str) -> int:
+        """Write what can be written."""
+        with suppress(OSError):
+            self._real.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        """Flush what can be flushed."""
+        with suppress(OSError):
+            self._real.flush()
+
+
 def stderr_console() -> Console:
     """Return a console on stderr: coloured on a terminal unless NO_COLOR is set, plain and unwrapped elsewhere."""
     plain = not sys.stderr.isatty() or bool(os.environ.get("NO_COLOR")) or os.environ.get("TERM") == "dumb"
     width = None if sys.stderr.isatty() else LINE
-    return Console(stderr=True, no_color=plain, highlight=False, soft_wrap=True, width=width, emoji=False)
+    file = cast(IO[str], _Stderr())
+    return Console(file=file, stderr=True, no_color=plain, highlight=False, soft_wrap=True, width=width, emoji=False)
 
 
 def emit_json(value: Mapping[str, Any]) -> None:

@@ -184,7 +184,7 @@ class Shooter:
         The bounds are the facts': the camera's own, and the rig's safety.max_exposure_s where that is less.
         """
         camera = self.facts.camera
-        bounded = min(max(wanted_s, camera.exposure_min_s), camera.exposure_max_s)
+        bounded = min(max(camera.exposure_min_s, wanted_s), camera.exposure_max_s)  # in this order NaN is the shortest
         self._asked_s = bounded
         used_s = guarded(lambda: self.rig.camera.set_exposure(bounded), "the camera")
         if used_s > camera.exposure_max_s * EXPOSURE_EXCESS:

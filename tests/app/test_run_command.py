@@ -15,6 +15,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from holocal.app.session import lock_of
+from holocal.loop.lock import locked
 from holocal.records.manifest import problems, read_manifest
 from holocal.records.maps import read_maps
 
@@ -137,6 +139,14 @@ def test_a_dry_run_prints_the_plan_and_touches_nothing(holocal, workplace):
     assert answer.status == 0
     assert answer.json["frames"] == 4 and answer.json["exposure_ceiling_s"] == 0.02
     assert list(workplace.iterdir()) == []
+
+
+@pytest.mark.parametrize("command", [(*RUN, "--dry-run"), ("render", "points.csv", "--rig", "lab-bench", "--json")])
+def test_what_only_asks_a_real_rig_for_its_facts_does_not_disturb_who_works_with_it(holocal, workplace, command):
+    (workplace / "points.csv").write_text("theta_x_deg,theta_y_deg,distance_m,intensity\n0,0,inf,1\n")
+    with locked(lock_of("lab-bench"), "rig lab-bench"):
+        answer = holocal(*command)
+    assert answer.status == 75, answer.err
 
 
 def test_the_same_seed_gives_the_same_maps_and_another_seed_others(holocal):
