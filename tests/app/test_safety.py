@@ -44,7 +44,8 @@ def begun(place: Path, command: tuple[str, ...], *sets: str) -> subprocess.Popen
     """Start a command of the program in a process of its own, on the bench with a diary."""
     write_frame(place / "frame.png", np.random.default_rng(5).integers(0, 256, (24, 32), np.uint8))
     words = [*command, "--rig", "lab-bench", "--set", f"faults.diary={place / 'diary'}", *sets]
-    main = "from holocal.app.cli.main import main; main()"
+    # Whoever runs these tests may ignore the signals that a child would inherit so, as `nohup` does.
+    main = "import signal as s; s.signal(s.SIGHUP, s.SIG_DFL); from holocal.app.cli.main import main; main()"
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(LAB), os.environ.get("PYTHONPATH", "")])}
     return subprocess.Popen(
         [sys.executable, "-c", main, *words], cwd=place, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE
