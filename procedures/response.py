@@ -219,7 +219,8 @@ class Response:
         camera = state.facts.camera
         exposure_s = picture_exposure_s(state.light_per_s, (camera.height, camera.width), camera.full_scale)
         measured = state.table.phase_rad
-        for name, table in (("before", state.in_force), ("rising", measured), ("falling", -measured)):
+        # "before" and the right sign's may be almost one pattern: the other comes between, so a kept one is noticed
+        for name, table in (("rising", measured), ("falling", -measured), ("before", state.in_force)):
             image = blob_image(camera.height, camera.width)
             levels = image_levels(image, state.facts, state.engine, seed=state.seed, response_rad=table)
             yield _shot(state, f"picture-{name}", levels, exposure_s=exposure_s, clip_limit=1.0, keep=True)
@@ -356,7 +357,9 @@ def _with_pictures(state: State, frames: Sequence[Frame]) -> State:
     """Return the state with the sign that the pictures tell, or that was given, put into the table."""
     assert state.dark is not None
     assert state.table is not None
-    seen = [(frame.counts - state.dark.astype(np.float32)) / np.float32(frame.exposure_s) for frame in frames]
+    rising_frame, falling_frame, before = frames
+    ordered = (before, rising_frame, falling_frame)
+    seen = [(frame.counts - state.dark.astype(np.float32)) / np.float32(frame.exposure_s) for frame in ordered]
     alike = tuple(likeness(picture) for picture in seen)
     given = state.parameters.sign
     told = alike[2] <= alike[1] + TELLING  # unless the pictures speak against it, a phase rises with the level

@@ -31,6 +31,7 @@ from rigs.simulated.stencil import Factors, Stencil, apply, fit_stencil
 
 NUFFT_EPS = 1e-3  # relative, each patch; the phase model's 0.002 rad is the larger error
 PATCH_PX = (384, 360)  # patch in the panel's middle, columns and rows, for a phase error of 0.002 rad rms
+PATCH_PUPIL_M = 4e-3  # wider pupils need smaller patches: a patch of 240 x 136 pixels leaves 0.003 rad at 9 mm
 # The mirror is nearer to +x directions: there patches are narrower, else their errors are five times those at -x.
 PATCH_SLOPE_PER_M = 60.0
 # A line's pieces hold, beside the patch's own light, the bend of its wave against the middle patch's. Six patches: half
@@ -57,9 +58,10 @@ class _Patch:
     columns: slice
     phase: Complex  # illumination, alpha and amplitude over the patch
     needed: NDArray[np.intp]  # which of the coarse points (columns, rows), flat
+    to_pupil: NDArray[np.float32]  # the amplitude's other factor, at the coarse points
     first: Factors  # of the stencil, at the inner coarse points
     second: Factors
-    weight: Complex  # at the coarse points: the amplitude's other factor, and the rest of the carrier
+    carrier: Complex  # at the coarse points: what the fine carriers leave of the patch's wave
 
 
 class PanelToPupil:
@@ -83,7 +85,7 @@ class PanelToPupil:
     pupil_edge_m
         Width over which the pupil's transmission falls from 1 to 0, half way at its nominal rim.
     patch_px
-        Widest patch, columns and rows.
+        Patch in the panel's middle, columns and rows; None for one that the pupil's width allows.
 
     Attributes
     ----------
@@ -102,7 +104,7 @@ class PanelToPupil:
         illumination: NDArray[np.float32] | Complex | None = None,
         fill_factor: float | None = None,
         pupil_edge_m: float = 2e-4,
-        patch_px: tuple[int, int] = PATCH_PX,
+        patch_px: tuple[int, int] | None = None,
     ) -> None:
         self.panel, self.wavelength_m, self.fill_factor = panel, wavelength_m, fill_factor
         self._illumination = illumination
@@ -113,8 +115,10 @@ class PanelToPupil:
         self.grid = PupilGrid.of(table, self.radius_m, wavelength_m, pupil_edge_m)
         self.transmission = self.grid.transmission(bench.pupil_diameter_m / 2, pupil_edge_m)
         self._pool = ThreadPoolExecutor(max(1, torch.get_num_threads()))
-        rows = _cuts(panel.y_m, np.full(panel.height, float(patch_px[1])))
-        columns = _cuts(panel.x_m, patch_px[0] * np.clip(1 - PATCH_SLOPE_PER_M * panel.x_m, 0.5, 1.5))
+        share = min(1.0, PATCH_PUPIL_M / bench.pupil_diameter_m)
+        across, down = patch_px or (share * PATCH_PX[0], share * PATCH_PX[1])
+        rows = _cuts(panel.y_m, np.full(panel.height, float(down)))
+        columns = _cuts(panel.x_m, across * np.clip(1 - PATCH_SLOPE_PER_M * panel.x_m, 0.5, 1.5))
         cells = [[(r, c) for c in group] for r in rows for group in _groups(columns, LINE_PATCHES)]
         boxes = [self._box(*cell) for line in cells for cell in line]
         kernels = list(self._pool.map(lambda box: fit_patch(table, box, wavelength_m), boxes))
@@ -214,13 +218,12 @@ class PanelToPupil:
             phase *= self._illumination[rows, columns]
         coarse = place.across.coarse_m, self._down.coarse_m
         rest = _rest(place.kernel.beta - place.reference, *coarse, axis=1)
-        weight = unit_phase((rest + stencil.constant.on_grid(*coarse)).T)
-        weight *= _turned(stencil.to_pupil, coarse)
-        first, second = (
-            tuple(np.ascontiguousarray(_turned(part, coarse)[1:-1, 1:-1]) for part in parts)
-            for parts in (stencil.first, stencil.second)
+        carrier = unit_phase((rest + stencil.constant.on_grid(*coarse)).T)
+        first = tuple(0.5 * _turned(part, coarse)[1:-1, 1:-1] for part in stencil.first)
+        second = tuple(
+            share * _turned(part, coarse)[1:-1, 1:-1] for share, part in zip((1, 1, 0.25), stencil.second, strict=True)
         )
-        return _Patch(plan, rows, columns, phase, needed, first, second, weight)
+        return _Patch(plan, rows, columns, phase, needed, _turned(stencil.to_pupil, coarse), first, second, carrier)
 
     def _amplitude(self, kernel: PatchKernel, *, dead: bool) -> Array:
         """Return what a pixel's active square, or its dead frame, sends to the pupil, per unit amplitude on the panel.
@@ -284,10 +287,10 @@ class PanelToPupil:
 def _piece(patch: _Patch, modulation: Complex | None) -> torch.Tensor:
     """Return a patch's field at its coarse points, (columns, rows), 0 where it is not needed."""
     source = patch.phase if modulation is None else modulation[patch.rows, patch.columns] * patch.phase
-    piece = np.zeros(patch.weight.shape, np.complex64)
+    piece = np.zeros(patch.carrier.shape, np.complex64)
     piece.ravel()[patch.needed] = patch.plan.execute(source.ravel())
-    apply(piece, patch.first, patch.second)
-    piece *= patch.weight
+    apply(piece, patch.to_pupil, patch.first, patch.second)
+    piece *= patch.carrier
     return torch.from_numpy(piece)
 
 

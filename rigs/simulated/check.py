@@ -28,9 +28,8 @@ from rigs.simulated.panel import before_modulation, modulation, pixels_of
 
 STEP_DEG = 0.0098  # a speckle grain of the whole pupil
 LARGEST_TURN_RAD, LARGEST_SHIFT_M = 0.3 * DEGREE, 0.2 * MM  # of the drawn misalignments, each axis
-FIELD_SHARE = (
-    0.7  # patches lie within this share of the panel's picture: beyond, the pupil's rim cuts most of the light
-)
+# Patches lie within this share of the panel's picture: beyond, the pupil's rim cuts most of the light.
+FIELD_SHARE = 0.7
 
 
 def patch_errors(

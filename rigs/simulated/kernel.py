@@ -11,6 +11,7 @@ What is left of it `stencil` makes up for.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -127,6 +128,7 @@ class PathTable:
     sin_y: Array
 
     @classmethod
+    @lru_cache(maxsize=4)  # it knows no wavelength: the next line of the laser finds it made
     def trace(cls, bench: Bench, panel: Box, pupil: Box) -> PathTable:
         """Trace the rays between all nodes; the only place where the rig meets the bench."""
         x, q = _grid(panel, PANEL_NODES), _grid(pupil, Q_NODES)

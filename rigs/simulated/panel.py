@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -35,10 +37,25 @@ def modulation(slm: SlmTable, levels: NDArray[np.uint8], wavelength_m: float) ->
     """Return what the levels do to the light, (height, width) complex64 of modulus 1."""
     table = phase_of_levels(slm, wavelength_m)
     if slm.crosstalk_um > 0:  # the fringing field blurs the phase itself, fly-back of a wrap included
-        sigma = slm.crosstalk_um / slm.pitch_um
-        phase = cv2.GaussianBlur(table.astype(np.float32)[levels], (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
+        kernel = crosstalk_kernel(slm.crosstalk_um / slm.pitch_um)
+        phase = cv2.sepFilter2D(table.astype(np.float32)[levels], -1, kernel, kernel, borderType=cv2.BORDER_REPLICATE)
         return unit_phase(phase.astype(np.float64))
     return np.asarray(np.take(unit_phase(table), levels))
+
+
+def crosstalk_kernel(sigma_px: float) -> Array:
+    """Return what of its neighbours' phase a pixel has, (odd,): the mean over it of their squares, blurred.
+
+    A square blurred by a Gaussian and averaged over a square is the second difference of the Gaussian's second integral
+    x Phi(x) + sigma^2 phi(x). The Gaussian at the pixels alone would leave 0.57 of a grating of two pixels at a blur of
+    half a pixel, where 0.24 are left.
+    """
+    reach = int(np.ceil(5 * sigma_px)) + 1
+    x = np.arange(-reach - 1, reach + 2) / sigma_px
+    below = np.array([0.5 * math.erfc(-t / math.sqrt(2)) for t in x])
+    integral = sigma_px * (x * below + np.exp(-x * x / 2) / math.sqrt(2 * math.pi))
+    kernel = np.diff(integral, 2)
+    return np.asarray(kernel / kernel.sum())
 
 
 def flatness_m(slm: SlmTable) -> Array | None:

@@ -32,9 +32,9 @@ Factors = tuple[NDArray[np.float32], ...]
 class Stencil:
     """The amplitude as a product, and the factors over the pupil of what is left.
 
-    `from_panel` (over the patch, mean 1) times `to_pupil` is the amplitude; `constant` a phase, radians; `first` the
-    factors of sin theta along x and y in the amplitude; `second` those of 2 - 2 cos theta along x, along y, and of
-    sin theta_x sin theta_y in the phase. `residual` is the relative rms error of the field that is left.
+    The amplitude is `from_panel` (over the patch, mean 1) times `to_pupil`, plus `first` times sin theta along x and y;
+    to the phase comes `constant`, and `second` times 2 - 2 cos theta along x, along y, and sin theta_x sin theta_y.
+    `residual` is the relative rms error of the field that is left.
     """
 
     from_panel: Polynomial
@@ -51,11 +51,11 @@ def fit_stencil(kernel: PatchKernel, amplitude: Array, step_m: tuple[float, floa
     `amplitude` (panel nodes, pupil nodes) is what a pixel sends to the pupil.
     """
     pupil, weight = kernel.beta.box, panel_weight()
-    a, b = _product(amplitude, weight, pupil_weight(pupil))
-    scale = np.where(np.abs(b) > 1e-6 * np.abs(b).max(), b, np.inf)  # where there is no light nothing is left of it
+    over = pupil_weight(pupil)
+    a, b = _product(amplitude, weight, over)
     turn_x, turn_y = _turns(kernel, step_m)
     waves = [np.sin(turn_x), np.sin(turn_y)]
-    first, of_amplitude = _least_squares(waves, ((amplitude - np.outer(a, b)) / scale).T, weight)
+    first, of_amplitude = _least_squares(waves, (amplitude - np.outer(a, b)).T, weight)
     waves = [np.ones_like(turn_x), 2 - 2 * np.cos(turn_x), 2 - 2 * np.cos(turn_y), np.sin(turn_x) * np.sin(turn_y)]
     second, of_phase = _least_squares(waves, kernel.rest_rad.T, weight)
 
@@ -68,7 +68,7 @@ def fit_stencil(kernel: PatchKernel, amplitude: Array, step_m: tuple[float, floa
         constant=over_pupil(second[0]),
         first=(over_pupil(first[0]), over_pupil(first[1])),
         second=(over_pupil(second[1]), over_pupil(second[2]), over_pupil(second[3])),
-        residual=float(np.sqrt((of_amplitude + of_phase) @ pupil_weight(pupil))),
+        residual=float(np.sqrt((of_amplitude + b**2 * of_phase) @ over / (b**2 @ over))),
     )
 
 
@@ -100,34 +100,33 @@ def _least_squares(waves: list[Array], wanted: Array, weight: Array) -> tuple[Ar
     return np.asarray(found[..., 0].T), np.asarray(np.sum((system @ found - target)[..., 0] ** 2, axis=1))
 
 
-def apply(piece: Complex, first: Factors, second: Factors) -> None:
-    """Make up, in place, for what the form leaves of a patch's field at its samples, (columns, rows).
+def apply(piece: Complex, to_pupil: NDArray[np.float32], first: Factors, second: Factors) -> None:
+    """Give a patch's field at its samples, (columns, rows), its amplitude, and make up for what the form leaves.
 
-    The factors belong to the inner samples; the outermost ring is left as it is.
+    In place. The factors of the stencil belong to the inner samples; the outermost ring is left without.
     """
     inner, right, left = piece[1:-1, 1:-1], piece[2:, 1:-1], piece[:-2, 1:-1]
     up, down = piece[1:-1, 2:], piece[1:-1, :-2]
     twice = inner + inner
-    change = twice - right
-    change -= left
-    change *= second[0]
+    bend = twice - right
+    bend -= left
+    bend *= second[0]
     twice -= up
     twice -= down
     twice *= second[1]
-    change += twice
+    bend += twice
     np.subtract(piece[:-2, 2:], piece[:-2, :-2], out=twice)
     twice += piece[2:, :-2]
     twice -= piece[2:, 2:]
-    twice *= second[2]
-    twice *= np.float32(0.25)
-    change += twice
-    np.subtract(left, right, out=twice)  # i times half of it is the sine's own difference
-    twice *= first[0]
-    twice *= np.float32(0.5)
-    change += twice
+    twice *= second[2]  # sin sin is a fourth of this
+    bend += twice
+    slope = left - right  # i times half of it is the sine's
+    slope *= first[0]
     np.subtract(down, up, out=twice)
     twice *= first[1]
-    twice *= np.float32(0.5)
-    change += twice
-    inner.real -= change.imag
-    inner.imag += change.real
+    slope += twice
+    inner.real -= bend.imag
+    inner.imag += bend.real
+    piece *= to_pupil
+    inner.real -= slope.imag
+    inner.imag += slope.real
