@@ -19,10 +19,10 @@ from holocal.hologram.footprint import EDGE_M, transmission
 from holocal.hologram.phase_model import wanted_phase
 from holocal.hologram.reference import reference_turns
 from holocal.hologram.scenes.points import PointCloud
-from holocal.hologram.series import Series, fit_series
 from holocal.hologram.settings import HologramSettings
 from holocal.optics.bench import Array
 from holocal.optics.phase_function import VirtualPoints
+from holocal.optics.series import Series, fit_series
 
 _PAIRS = 200_000  # traced at a time
 _DEGREES = (16, 32, 64)  # of a point's phase and pupil over the panel: 16 leaves 1e-4 rad on the 4K panel

@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from holocal.errors import InputError
 from holocal.hologram.encode.blocks import in_blocks
-from holocal.hologram.series import Series
 from holocal.optics.bench import Panel
+from holocal.optics.series import Series
 
 LEVELS = 256
 _FINE = 16384  # phases that a measured response is tabulated at: 1/64 of a level

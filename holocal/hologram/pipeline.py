@@ -22,10 +22,10 @@ from holocal.hologram.frame import panel_phase, phase_to_levels
 from holocal.hologram.reference import PupilWindow, pupil_window, reference_turns
 from holocal.hologram.scenes.image import InitialPhase, RandomPhase, image_cloud
 from holocal.hologram.scenes.points import PointCloud
-from holocal.hologram.series import Series
 from holocal.hologram.settings import HologramSettings
 from holocal.hologram.stored import Store
 from holocal.hologram.synthesis import synthesise
+from holocal.optics.series import Series
 
 __all__ = ["HologramSettings", "Rendered", "render", "render_image"]
 

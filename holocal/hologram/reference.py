@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from holocal.errors import InputError
-from holocal.hologram.series import Series, fit_series
 from holocal.hologram.settings import HologramSettings
 from holocal.optics.bench import Array
 from holocal.optics.phase_function import pupil_rim
 from holocal.optics.raytrace import Connection, connect
+from holocal.optics.series import Series, fit_series
 
 # Degree 8 leaves 2e-4 rad on the nominal bench at gaze 0 and 3e-3 rad at a gaze of 13 degrees; 12 leaves 1e-5 rad.
 _DEGREE = 12

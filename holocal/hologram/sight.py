@@ -16,11 +16,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from holocal.hologram.reference import central_rays, turns_at
-from holocal.hologram.series import Series, fit_series
 from holocal.hologram.settings import HologramSettings
 from holocal.optics.bench import Array
 from holocal.optics.phase_function import VirtualPoints, pupil_grid, trace_points
 from holocal.optics.raytrace import connect
+from holocal.optics.series import Series, fit_series
 
 _DEGREE = 10  # of s(x) and x(s): 1e-9 m over the 4K panel and 10 % beyond
 _REFERENCE_DEGREE = 12  # 1e-5 rad on the nominal bench up to a gaze of 13 degrees

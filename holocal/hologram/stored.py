@@ -12,12 +12,12 @@ from typing import Protocol
 
 import numpy as np
 
-from holocal.hologram.series import Series
 from holocal.hologram.settings import HologramSettings
 from holocal.hologram.sight import Sight
 from holocal.hologram.warp import Box, Depth, Warp
 from holocal.hologram.warped import Layout, Patch, PatchForm, SightGrid, WarpedPlan, accurate_plan, warped_plan
 from holocal.optics.bench import Array
+from holocal.optics.series import Series
 
 METHOD = 3  # raised whenever a plan of the same settings comes out different
 Arrays = Mapping[str, Array]

@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from holocal.hologram.phase_model import wanted_phase
-from holocal.hologram.series import Series, chebyshev_products, fit_series
 from holocal.hologram.settings import HologramSettings
 from holocal.hologram.sight import Sight
 from holocal.optics.bench import Array
 from holocal.optics.phase_function import VirtualPoints
+from holocal.optics.series import Series, chebyshev_products, fit_series
 
 FIELD_NODES, PANEL_NODES = 9, 13
 PANEL_DEGREE = 5  # total, of a and g: degree 4 leaves twice the error

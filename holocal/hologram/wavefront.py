@@ -8,8 +8,8 @@ from math import isfinite
 import numpy as np
 
 from holocal.errors import InputError
-from holocal.hologram.series import chebyshev_products
 from holocal.optics.bench import Array
+from holocal.optics.series import chebyshev_products
 from holocal.optics.zernike import zernike
 
 

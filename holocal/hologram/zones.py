@@ -15,10 +15,10 @@ from scipy.spatial import ConvexHull
 
 from holocal.hologram.footprint import sample_footprint
 from holocal.hologram.reference import PupilWindow, pupil_window, reference_turns
-from holocal.hologram.series import Series, chebyshev_products, fit_series
 from holocal.hologram.settings import HologramSettings, Zones
 from holocal.optics.bench import Array
 from holocal.optics.phase_function import PhaseFunctions, VirtualPoints, phase_functions, pupil_rim, trace_points
+from holocal.optics.series import Series, chebyshev_products, fit_series
 
 OUTLINE_MARGIN = 1.15  # of the pupil: a mirror turned by 0.3 degrees moves the footprints by a tenth of their width
 _CORNERS = 6  # grid lines of corners across the field when the zones themselves have fewer

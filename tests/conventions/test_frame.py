@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from holocal.errors import InputError
 from holocal.hologram.frame import pack_rgb, panel_phase, phase_to_levels, unpack_rgb
-from holocal.hologram.series import Series
 from holocal.optics.bench import Panel
+from holocal.optics.series import Series
 
 STEP = 2 * np.pi / 256
 

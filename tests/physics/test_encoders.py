@@ -20,8 +20,8 @@ from holocal.hologram.encode.gradient_descent import GradientDescent
 from holocal.hologram.encode.ifta_encoder import Ifta
 from holocal.hologram.encode.levels import Levels
 from holocal.hologram.frame import panel_phase, phase_to_levels
-from holocal.hologram.series import Series
 from holocal.optics.bench import Panel
+from holocal.optics.series import Series
 
 ENCODERS = [
     Ifta(6),

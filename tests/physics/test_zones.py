@@ -12,7 +12,6 @@ from holocal.hologram.encode.fourier import WindowedTransform
 from holocal.hologram.footprint import row_spans, sample_footprint, soft_span
 from holocal.hologram.grid import Grid, panel_grid, resample_compact, synthesis_grid
 from holocal.hologram.reference import pupil_window, reference_turns
-from holocal.hologram.series import fit_series
 from holocal.hologram.settings import HologramSettings, Zones
 from holocal.hologram.wavefront_error import zone_wavefront_errors
 from holocal.hologram.zone_sum import zone_sum
@@ -20,6 +19,7 @@ from holocal.hologram.zones import point_table, table_points, zone_plan
 from holocal.optics.bench import Bench, Panel, Pose
 from holocal.optics.phase_function import VirtualPoints, exact_phase, pupil_rim
 from holocal.optics.raytrace import connect
+from holocal.optics.series import fit_series
 
 DEG = np.pi / 180
 PITCH = 3.74e-6

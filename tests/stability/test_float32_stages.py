@@ -15,12 +15,12 @@ from holocal.hologram.encode.fourier import WindowedTransform
 from holocal.hologram.encode.ifta import ifta, unit_modulus
 from holocal.hologram.frame import panel_phase, phase_to_levels
 from holocal.hologram.reference import reference_turns
-from holocal.hologram.series import Series
 from holocal.hologram.settings import HologramSettings, Warped
 from holocal.hologram.warp import Depth
 from holocal.hologram.warped import accurate_plan, inside_outline, pupil_mask, warped_plan
 from holocal.hologram.warped_sum import patch_sums, phasor, to_panel
 from holocal.optics.bench import Bench, Panel
+from holocal.optics.series import Series
 
 DEG = np.pi / 180
 BASE = HologramSettings(Panel(64, 48, 3.74e-6), Bench(), 515e-9, (12 * DEG, 10 * DEG))
