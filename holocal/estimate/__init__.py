@@ -1,6 +1,6 @@
 """From frames to what they say, with how sure: no hardware, no files, no plots.
 
-==============  =========================================================================
+==============  ===========================================================================
 blocks          local mean brightness of a speckled picture, and its noise
 thesis_map      the thesis's estimate of the brightness: block means, then a Gaussian
 registration    where the camera sees the image, from a frame of blobs
@@ -8,5 +8,7 @@ brightness      the default: one smooth map from all frames, by a Gaussian proce
 uniformity      non-uniformity of a picture, speckle taken out, with its error
 fringes         the phases of unknown steps, from the fringe that every camera pixel sees
 response        the phase of every level of a panel, from the phases of some
-==============  =========================================================================
+posterior       samples of what measurements leave possible, round a maximum-likelihood fit
+coverage        whether errors are as large as they are said to be
+==============  ===========================================================================
 """
