@@ -32,6 +32,7 @@ def write_figures(directory: Path, figures: Sequence[Figure]) -> None:
                 "caption": figure.caption,
                 "extent_deg": figure.extent_deg,
                 "target": figure.target,
+                "labels": list(figure.labels),
                 "arrays": list(figure.arrays),
             }
         )
@@ -60,6 +61,7 @@ def read_figures(directory: Path) -> tuple[Figure, ...]:
                     caption=said["caption"],
                     extent_deg=tuple(said["extent_deg"]) if said["extent_deg"] else None,
                     target=said["target"],
+                    labels=tuple(said.get("labels", ())),  # runs of before there were any have none
                 )
                 for number, said in enumerate(words)
             )

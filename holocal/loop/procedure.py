@@ -74,7 +74,12 @@ class Plan:
 
 @dataclass(frozen=True)
 class Figure:
-    """A picture for the report: its data, not its drawing. `kind` is "map", "image", "curve", "pair" or "histogram"."""
+    """A picture for the report: its data, not its drawing.
+
+    `kind` is "map", "image", "curve", "pair", "histogram" or "corner". A corner shows the "samples" (k, d) of a
+    posterior, at most the first 12 parameters, with the names `labels`; its arrays "truth" (d,), "laplace_mean" (d,)
+    and "laplace_covariance" (d, d) are drawn over them where they are given.
+    """
 
     name: str
     title: str
@@ -84,6 +89,7 @@ class Figure:
     caption: str = ""
     extent_deg: tuple[float, float, float, float] | None = None  # left, right, bottom, top
     target: float | None = None
+    labels: tuple[str, ...] = ()  # of a corner's parameters
 
 
 @dataclass(frozen=True)

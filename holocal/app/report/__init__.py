@@ -4,6 +4,7 @@
 page            gathers what the run left and fills the template
 numbers         numbers as they are read
 drawing         figures as PNG data, one style for all of them
+corner          the samples of a posterior, pair by pair
 template.html   the page
 ==============  ==========================================================
 """

@@ -45,6 +45,10 @@ def draw(figure: Figure) -> str:
                 canvas = _curve(figure)
             case "histogram":
                 canvas = _histogram(figure)
+            case "corner":
+                from holocal.app.report.corner import draw_corner  # it takes its colours from here
+
+                canvas = draw_corner(figure)
             case _:
                 canvas = _map(figure)
         return data_uri(canvas)
