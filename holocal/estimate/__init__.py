@@ -8,5 +8,11 @@ brightness      the default: one smooth map from all frames, by a Gaussian proce
 uniformity      non-uniformity of a picture, speckle taken out, with its error
 fringes         the phases of unknown steps, from the fringe that every camera pixel sees
 response        the phase of every level of a panel, from the phases of some
+lit_pupil       what of a wavefront a cut pupil shows, and a bias that spreads its spot
+mirrored_pictures
+                what two pictures at opposite biases say about an aberration
+model_free      the aberration of every zone without a model: plan, trials, steps
+model_free_state, model_free_result
+                its plan and state; what it found, how sure, what did not work
 ==============  =========================================================================
 """

@@ -51,12 +51,14 @@ class Pair:
 class Step:
     """What is wrong in one zone: `modes_rad` with its `covariance`, the spot's place `shift_px` (column, row).
 
-    `misfit` is the reduced chi-squared of the difference against the camera's noise alone.
+    `left` (h, w) is the part of the difference that the modes do not explain; `misfit` its reduced chi-squared against
+    the camera's noise alone (2 to 6 with encoding noise of 1.5 % of a spot's power).
     """
 
     modes_rad: Array
     covariance: Array
     shift_px: Array
+    left: Array
     misfit: float
 
 
@@ -81,13 +83,20 @@ def centroid_px(counts: Array, usable: Mask) -> Array:
     return np.stack([bright.sum(axis=1) @ columns / total, bright.sum(axis=2) @ rows / total], axis=1)
 
 
-def share_within(counts: Array, usable: Mask) -> Array:
-    """Return (zones,) the share of the light that the brightest 3 x 3 pixels hold: how sharp a spot is."""
-    kept = np.where(usable, counts, 0.0)
-    box = np.abs(np.subtract.outer(np.arange(counts.shape[1]), np.arange(counts.shape[1]))) <= 1
-    side = np.abs(np.subtract.outer(np.arange(counts.shape[2]), np.arange(counts.shape[2]))) <= 1
-    total = np.maximum(kept.sum(axis=(1, 2)), 1e-12)
-    return np.asarray((box @ kept @ side).max(axis=(1, 2)) / total)
+def share_within(counts: Array, usable: Mask, noise: Noise) -> tuple[Array, Array]:
+    """Return (zones,) the share of a spot's light that its brightest 3 x 3 pixels hold, and its standard error.
+
+    The spot's light is that of 15 x 15 pixels: over a whole window read noise sums to a sixth of a faint spot.
+    """
+    kept = np.where(usable, counts - np.median(counts, axis=(1, 2), keepdims=True), 0.0)
+    inner, outer = (_boxes(kept, half) for half in (1, 7))
+    error = _boxes(np.where(usable, noise.variance(counts), 0.0), 7)
+    best = inner.reshape(len(counts), -1).argmax(axis=1)
+    core, total, variance = (
+        part.reshape(len(counts), -1)[np.arange(len(counts)), best] for part in (inner, outer, error)
+    )
+    total = np.maximum(total, 1e-12)
+    return core / total, np.sqrt(variance) / total
 
 
 def mirrored_pair(one: Array, one_usable: Mask, other: Array, other_usable: Mask, noise: Noise) -> Pair:
@@ -123,7 +132,9 @@ def solve_step(
     mean, difference, variance = pair.mean[zone], pair.difference[zone], pair.variance[zone]
     along_rows, along_columns = np.gradient(mean)
     # a spot off by a pixel is off by one each way in the two pictures: -2 times the slope of the picture
-    raw = np.concatenate([slopes, np.stack([-2 * along_columns, -2 * along_rows, mean, np.ones_like(mean) * mean.max()])])
+    raw = np.concatenate(
+        [slopes, np.stack([-2 * along_columns, -2 * along_rows, mean, np.ones_like(mean) * mean.max()])]
+    )
     design = (rows @ raw @ columns).reshape(len(raw), -1).T
     smooth = np.maximum(rows @ mean @ columns, 0.0)
     # nothing is known better than a hundredth of the peak's roughness: the tails are not the place to fit
@@ -144,7 +155,7 @@ def solve_step(
     misfit = float(np.sum(left**2 / variance) / (left.size - len(raw)))
     length = float(np.linalg.norm(solution[:count]))
     modes = solution[:count] * min(1.0, LONGEST_RAD / max(length, 1e-12))
-    return Step(modes, covariance[:count, :count], solution[count : count + 2], misfit)
+    return Step(modes, covariance[:count, :count], solution[count : count + 2], left, misfit)
 
 
 def _noise_scale(design: Array, target: Array, weight: Array) -> float:
@@ -152,7 +163,13 @@ def _noise_scale(design: Array, target: Array, weight: Array) -> float:
     root = np.sqrt(weight)
     fitted = np.linalg.lstsq(design * root[:, None], target * root, rcond=None)[0]
     left = (target - design @ fitted) * root
-    return max(float(left @ left) / max(len(target) - design.shape[1], 1), 1e-12)
+    return float(max(left @ left / max(len(target) - design.shape[1], 1), 1e-12))
+
+
+def _boxes(values: Array, half: int) -> Array:
+    """Return the sums over squares of 2 half + 1 pixels around every pixel."""
+    rows, columns = (np.abs(np.subtract.outer(np.arange(n), np.arange(n))) <= half for n in values.shape[1:])
+    return np.asarray(rows @ values @ columns)
 
 
 def _blur_matrix(size: int, sigma_px: float) -> Array:

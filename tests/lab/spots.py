@@ -28,7 +28,7 @@ READ_ELECTRONS = 6.0
 
 @dataclass(frozen=True)
 class Cut:
-    """A rectangle that lights a part of the pupil: its middle and its sides in m; `fall` is the amplitude's, over it."""
+    """A rectangle that lights a part of the pupil: its middle and its sides in m; `fall` is the amplitude's, over y."""
 
     x_m: float = 0.0
     y_m: float = 0.0
