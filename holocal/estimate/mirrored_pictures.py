@@ -19,7 +19,6 @@ Mask = NDArray[np.bool_]
 ROUGH = 0.03  # of a pixel's light: what encoding noise adds, as weights of the fit; the errors come from the residuals
 SATURATED = 0.93  # of full scale: above it a pixel with a dark level of some percent may have been clipped
 LONGEST_RAD = 3.0  # of one step, rms over the lit part
-NUISANCES = 4  # a shift along columns and rows, power, an even background
 
 
 @dataclass(frozen=True)
@@ -38,12 +37,13 @@ class Noise:
 class Pair:
     """Two pictures (zones, h, w) over their totals, the second turned: half their sum, their difference, its variance.
 
-    `lit` (zones,) where both have light that stands out of the noise.
+    `usable` (zones, h, w) where both pictures are; `lit` (zones,) where both have light that stands out of the noise.
     """
 
     mean: Array
     difference: Array
     variance: Array
+    usable: Mask
     lit: Mask
 
 
@@ -111,7 +111,7 @@ def mirrored_pair(one: Array, one_usable: Mask, other: Array, other_usable: Mask
     first, second = one / totals[0], turned / totals[1]
     middle = np.where(both, (first + second) / 2, np.where(one_usable, first, np.where(turned_usable, second, 0.0)))
     variance = noise.variance(one) / totals[0] ** 2 + noise.variance(turned) / totals[1] ** 2
-    return Pair(middle, np.where(both, first - second, 0.0), variance, lit)
+    return Pair(middle, np.where(both, first - second, 0.0), variance, both, lit)
 
 
 def solve_step(
@@ -130,11 +130,7 @@ def solve_step(
     """
     rows, columns = (_blur_matrix(n, blur_px) for n in pair.mean.shape[1:])
     mean, difference, variance = pair.mean[zone], pair.difference[zone], pair.variance[zone]
-    along_rows, along_columns = np.gradient(mean)
-    # a spot off by a pixel is off by one each way in the two pictures: -2 times the slope of the picture
-    raw = np.concatenate(
-        [slopes, np.stack([-2 * along_columns, -2 * along_rows, mean, np.ones_like(mean) * mean.max()])]
-    )
+    raw = np.concatenate([slopes, _nuisances(mean)]) * pair.usable[zone]
     design = (rows @ raw @ columns).reshape(len(raw), -1).T
     smooth = np.maximum(rows @ mean @ columns, 0.0)
     # nothing is known better than a hundredth of the peak's roughness: the tails are not the place to fit
@@ -156,6 +152,13 @@ def solve_step(
     length = float(np.linalg.norm(solution[:count]))
     modes = solution[:count] * min(1.0, LONGEST_RAD / max(length, 1e-12))
     return Step(modes, covariance[:count, :count], solution[count : count + 2], left, misfit)
+
+
+def _nuisances(mean: Array) -> Array:
+    """Return the difference's answer (4, h, w) to a column and a row of shift, to power and to an even background."""
+    along_rows, along_columns = np.gradient(mean)
+    # a spot off by a pixel is off by one each way in the two pictures: -2 times the slope of the picture
+    return np.stack([-2 * along_columns, -2 * along_rows, mean, np.full_like(mean, mean.max())])
 
 
 def _noise_scale(design: Array, target: Array, weight: Array) -> float:

@@ -141,15 +141,17 @@ def _pushed(plan: SearchPlan, state: SearchState, pair: Pair) -> SearchState:
     """Return the state after a pair of a pass: the plain one, then one per mode; the last one solves."""
     mode = state.step // 2 - 1
     if mode < 0:
-        return replace(state, step=state.step + 1, plain=pair.difference)
+        return replace(state, step=state.step + 1, plain=pair.difference, plain_usable=pair.usable)
     size = np.where(plan.seen[:, mode], plan.pushes_rad[:, mode], 1.0)[:, None, None]
     slopes = state.slopes.copy()
-    slopes[:, mode] = (pair.difference - state.plain) / size
+    # saturated pixels come and go: one that is missing in either says nothing
+    answer = np.where(pair.usable & state.plain_usable, pair.difference - state.plain, 0.0)
+    slopes[:, mode] = answer / size
     state = replace(state, step=state.step + 1, slopes=slopes)
     if mode + 1 < plan.modes.shape[1]:
         return state
     blur = np.where(state.passes == 0, COARSE_PX, _blurs(state))
-    state = _solved(plan, state, replace(pair, difference=state.plain), blur, 1.0)
+    state = _solved(plan, state, replace(pair, difference=state.plain, usable=state.plain_usable), blur, 1.0)
     return replace(state, stage=REFINE, step=0, passes=state.passes + 1, first_rad=state.moved_rad)
 
 

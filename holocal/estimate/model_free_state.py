@@ -58,7 +58,7 @@ class SearchPlan:
     def frames(self, passes: int) -> int:
         """Return how many frames a search of that many passes takes."""
         each = 2 * (1 + self.modes.shape[1]) + 2 * self.refinements
-        return 4 + passes * each + 2 * self.averages
+        return int(4 + passes * each + 2 * self.averages)
 
     @property
     def largest_rad(self) -> float:
@@ -89,10 +89,11 @@ class SearchState:
 
     `stage` and `step` say which frame is next. `modes_rad` (zones, modes) and `tilt_rad` (zones, 2) are the correction
     so far; `covariance` (zones, modes, modes) its error; `slopes` (zones, modes, h, w) the answers of the difference;
-    `plain` (zones, h, w) the difference that was not pushed; `moved_rad` and
+    `plain` (zones, h, w) the difference that was not pushed, `plain_usable` where it is known; `moved_rad` and
     `first_rad` (zones,) the last step and the last pass's first; `waiting` and `waiting_usable` the first picture of a
     pair; `tries_rad` (zones, averages, modes) the corrections that are averaged; `left` (zones, h, w) the mean of what
-    their pairs left unexplained, `left_square` (zones,) the mean of its sum of squares.
+    their pairs left unexplained, `left_square` (zones,) the mean of its sum of squares; `share_before`, `share_fall`
+    and `share_sigma` (zones,) how sharp a spot was, by how much less it is, and the error of that.
     """
 
     stage: str
@@ -107,6 +108,7 @@ class SearchState:
     misfit: Array
     slopes: NDArray[np.float32]
     plain: Array
+    plain_usable: Mask
     waiting: Array
     waiting_usable: Mask
     tries_rad: Array
@@ -203,6 +205,7 @@ def start(plan: SearchPlan, *, window: tuple[int, int] = (41, 41)) -> SearchStat
         misfit=np.full(zones, np.inf),
         slopes=np.zeros((zones, count, *window), np.float32),
         plain=np.zeros((zones, *window)),
+        plain_usable=np.zeros((zones, *window), bool),
         waiting=np.zeros((zones, *window)),
         waiting_usable=np.zeros((zones, *window), bool),
         tries_rad=np.zeros((zones, plan.averages, count)),
