@@ -5,6 +5,12 @@ quadratic biases are each other's mirror when the aberration is corrected (`mirr
 mode once at both biases tells how the difference answers to it; a linear solve says what is wrong. With N modes one
 such pass takes 2 N + 2 frames, after which every further pair of frames is a new measurement of what is left.
 
+Measured on 12 modes, 25 zones, a camera pixel 3.4 grains wide: 0.3 to 2 rad become 0.007 to 0.012 rad (rms over
+the lit part, median zone; the worst 0.035) in 48 to 80 frames; 4 rad become 0.02 rad in 112 frames, where 3 zones in
+50 fail and say so.
+Second moments and the Gram matrix of gradients, then sharpness, stay at 0.07 to 0.3 rad there in 72 to 144 frames: a
+sharp spot is smaller than a pixel, and both are even in the aberration, so that they are flat where it is found.
+
 =======  =====================================================================================
 before   1 frame without bias: which zones have light, where the spot is, how sharp it is
 centre   1 pair: steers the spot's centre of symmetry to the window's centre
@@ -94,7 +100,8 @@ def take(
     Parameters
     ----------
     windows
-        (zones, h, w) counts, the dark level subtracted, around each zone's place.
+        (zones, h, w) counts, the dark level subtracted, around each zone's place. Every frame is exposed for itself: a
+        spot without bias is some hundred times as bright as a biased one.
     usable
         Pixels that are neither hot nor dead; saturated ones are left out here.
     full_scale

@@ -75,7 +75,8 @@ def _reason(plan: SearchPlan, state: SearchState, zone: int, sigma_rad: float) -
     if (unexplained := _unexplained(plan, state, zone)) > LARGEST_UNEXPLAINED_RAD:
         return (
             f"the pictures keep a difference, as that of {unexplained:.2f} rad, that no searched mode explains "
-            f"(limit {LARGEST_UNEXPLAINED_RAD:g}); search more modes, or check the lit part that was expected."
+            f"(limit {LARGEST_UNEXPLAINED_RAD:g}); search more modes, start from a neighbour's correction, or "
+            f"check the lit part that was expected."
         )
     if state.share_fall[zone] > LARGEST_FALL + 4 * state.share_sigma[zone]:
         return (

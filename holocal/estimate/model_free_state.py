@@ -189,15 +189,21 @@ def search_plan(
     )
 
 
-def start(plan: SearchPlan, *, window: tuple[int, int] = (41, 41)) -> SearchState:
-    """Return the state before the first frame, for windows of that many rows and columns."""
+def start(plan: SearchPlan, *, window: tuple[int, int] = (41, 41), correction_rad: Array | None = None) -> SearchState:
+    """Return the state before the first frame, for windows of that many rows and columns.
+
+    `correction_rad` (zones, len(noll)) is what to start from, 0 if left out; what the lit part does not show is left.
+    """
     zones, count = plan.length.shape
+    modes_rad = np.zeros((zones, count))
+    if correction_rad is not None:
+        modes_rad = np.einsum("zmj,zj->zm", plan.modes, correction_rad) * inverse(plan.length) ** 2
     return SearchState(
         stage=BEFORE,
         step=0,
         passes=0,
         frames=0,
-        modes_rad=np.zeros((zones, count)),
+        modes_rad=modes_rad,
         tilt_rad=np.zeros((zones, 2)),
         covariance=np.stack([np.diag(row) for row in plan.priors_rad**2]),
         moved_rad=np.full(zones, np.inf),

@@ -222,6 +222,16 @@ def test_a_search_that_is_not_over_calls_no_zone_valid():
         model_free.take(plan, state, np.zeros((1, 5, 5)), np.ones((1, 5, 5), bool), full_scale=1.0, noise=NOISE)
 
 
+def test_a_search_can_start_from_what_is_known():
+    truth = drawn(2, 12, 4.0, 15)
+    spots = Spots((CUTS[0], CUTS[4]), NOLL, truth, seed=15)
+    plan = model_free.search_plan([LitPupil(*p) for p in spots.lit()], NOLL, px_per_gradient=STEER)
+    found = model_free.result(plan, model_free.start(plan, correction_rad=-truth))
+    # what is started from is the truth but for what the lit part does not show: 0.02 rad per rad at most
+    assert left_over(spots, found).max() < 0.02 * 4.0
+    assert np.abs(found.correction_rad[0] + truth[0]).max() < 1e-9  # the large pupil shows all
+
+
 @pytest.mark.parametrize("noll", [(), (3, 4), (4, 4)])
 def test_modes_that_cannot_be_searched_are_refused(noll):
     lit = [LitPupil(*Spots((SMALL,), NOLL, np.zeros((1, 12)), seed=0).lit()[0])]
