@@ -10,5 +10,14 @@ fringes         the phases of unknown steps, from the fringe that every camera p
 response        the phase of every level of a panel, from the phases of some
 posterior       samples of what measurements leave possible, round a maximum-likelihood fit
 coverage        whether errors are as large as they are said to be
+spot_model      what a camera window shows of a spot, through the known frame
+spot_fit        the wavefront of a zone, with nuisances, coarse to fine
+field_model     Zernike coefficients over the field, from all zones together
+lit_pupil       what of a wavefront a cut pupil shows, and a bias that spreads its spot
+mirrored_pictures
+                what two pictures at opposite biases say about an aberration
+model_free      the aberration of every zone without a model: plan, trials, steps
+model_free_state, model_free_result
+                its plan and state; what it found, how sure, what did not work
 ==============  ===========================================================================
 """
