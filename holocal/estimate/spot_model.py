@@ -1,0 +1,280 @@
+"""What a camera window shows of a spot: pupil field, pupil's rim, wavefront and amplitude to counts, with derivatives.
+
+The field that a *known* frame sends towards a zone is known: sum u exp(-i phi_p) over the panel's blocks
+(`holocal.optics.spots.analyse`), light meant for other zones and the quantisation's noise included. Unknown is what
+the bench adds to it. With U(q) that field over the points q at which the zone's own direction crosses the pupil,
+
+    E(ds) = sum_q T(q - q0) F [U exp(a + i W)](q) exp(i k q . ds),        I = integral of |E|^2 over a pixel
+
+W the wavefront (a delay, radians) and a the logarithm of the amplitude, both belonging to the panel's points; F the way
+from the panel's image to the pupil r in front of it (a phase k r ds^2 / 2 on the directions); T the pupil's
+transmission, q0 where it lies. (W and a put in the pupil's plane instead leave 0.1 rad of defocus at 4K: the beam's own fall-off is
+mistaken for it. F left out, the pupil's rim leaves 0.03 rad.)
+
+W and a are Legendre products over the box that the zone's light fills, along the camera's pixel axes: all
+transforms are separable, matrix products, and one set of them serves the derivatives by W and by a.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import finufft
+import numpy as np
+import torch
+from numpy.polynomial import legendre
+from numpy.typing import NDArray
+
+from holocal.optics.bench import Array
+
+NUFFT_EPS = 1e-4
+MARGIN_PX = 6  # the field is computed over so much more than the window: what W throws into it comes from there
+PER_FRINGE = 1.7  # samples per shortest period of the intensity; the pixel's own integral damps what would alias
+
+Seen = tuple[Array, NDArray[np.complex64]]  # pupil points (n, 2), values (n,): what `analyse` gives for a zone
+
+
+@dataclass(frozen=True)
+class Window:
+    """The pixels of a zone: (2 half + 1) columns and rows, the middle one at (column, row); where they look.
+
+    `direction` (2, 2) takes an offset in pixels (columns to the right, rows *up*) to direction sines in P.
+    """
+
+    column: int
+    row: int
+    half: tuple[int, int]
+    direction: Array
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows, columns."""
+        return 2 * self.half[1] + 1, 2 * self.half[0] + 1
+
+    def cut(self, picture: NDArray[np.generic]) -> NDArray[np.generic]:
+        """Return the window's pixels of a picture (height, width)."""
+        x, y = self.half
+        return picture[self.row - y : self.row + y + 1, self.column - x : self.column + x + 1]
+
+    @property
+    def pixel(self) -> float:
+        """A pixel's size in direction sines, the root of its area."""
+        return float(np.sqrt(abs(np.linalg.det(self.direction))))
+
+    @property
+    def to_pupil(self) -> Array:
+        """The matrix that takes points along the pixels' axes (n, 2) to pupil points: q = p @ to_pupil."""
+        return np.asarray(np.linalg.inv(self.direction / self.pixel))
+
+
+@dataclass(frozen=True)
+class PupilBox:
+    """The part of the pupil's plane that a zone's light fills: a box along the camera's pixel axes, metres.
+
+    A point p of it is the pupil point q = p @ `to_pupil`.
+    """
+
+    centre_m: tuple[float, float]
+    half_m: tuple[float, float]
+    to_pupil: Array
+
+    @classmethod
+    def around(cls, pupil_m: Array, window: Window, margin_m: float) -> PupilBox:
+        """Return the box round pupil points (n, 2), wider by a margin."""
+        turned = pupil_m @ np.linalg.inv(window.to_pupil)
+        low, high = turned.min(axis=0) - margin_m, turned.max(axis=0) + margin_m
+        middle, half = (low + high) / 2, (high - low) / 2
+        return cls((float(middle[0]), float(middle[1])), (float(half[0]), float(half[1])), window.to_pupil)
+
+    def legendre(self, pupil_m: Array, degree: int) -> Array:
+        """Return the products P_i P_j, (n, terms), at pupil points (n, 2)."""
+        turned = (pupil_m @ np.linalg.inv(self.to_pupil) - self.centre_m) / self.half_m
+        in_x, in_y = (legendre.legvander(turned[:, axis], degree) for axis in (0, 1))
+        return np.stack([in_x[:, i] * in_y[:, j] for i, j in products(degree)], axis=-1)
+
+
+def products(degree: int) -> tuple[tuple[int, int], ...]:
+    """Return (i, j) of the products P_i(x) P_j(y) of total degree up to `degree`; (0, 0) first, by degree.
+
+    >>> products(1)
+    ((0, 0), (1, 0), (0, 1))
+    """
+    return tuple((n - j, j) for n in range(degree + 1) for j in range(n + 1))
+
+
+@dataclass(frozen=True)
+class Pupil:
+    """The pupil: its radius, the width of its soft rim (a raised cosine), metres; and the wavelength."""
+
+    radius_m: float
+    edge_m: float
+    relief_m: float
+    wavelength_m: float
+
+    @property
+    def wavenumber(self) -> float:
+        """k, radians per metre."""
+        return 2 * np.pi / self.wavelength_m
+
+
+class SpotModel:
+    """The picture of one zone in several frames of known levels.
+
+    Parameters
+    ----------
+    window, box
+        The zone's pixels, and what part of the pupil's plane may be lit.
+    seen
+        For each frame the pupil points (n, 2) and values (n,) of `analyse`.
+    degree
+        Of W and a.
+    """
+
+    def __init__(
+        self, window: Window, seen: Sequence[Seen], box: PupilBox, pupil: Pupil, *, degree: int, device: str = "cpu"
+    ) -> None:
+        self.window, self.box, self.pupil, self.degree, self.device = window, box, pupil, degree, device
+        per_metre = pupil.wavenumber * window.pixel  # radians per pixel
+        lit = [min(half, pupil.radius_m + pupil.edge_m) for half in box.half_m]
+        self._fine = [int(np.ceil(PER_FRINGE * 2 * half * per_metre / (2 * np.pi) + 1)) for half in lit]
+        wide = [self._offsets(2 * (half + MARGIN_PX) + 1, f) for half, f in zip(window.half, self._fine, strict=True)]
+        # one sample more at each end: an integral over samples asks for the neighbours of its first and last
+        near = [self._offsets(2 * half + 1, f, more=1) for half, f in zip(window.half, self._fine, strict=True)]
+        grid = []  # of the pupil's plane: a period of the field's transform over its own width
+        for axis in (0, 1):
+            step = 2 * np.pi / (len(wide[axis]) / self._fine[axis]) / per_metre
+            low, high = box.centre_m[axis] - box.half_m[axis], box.centre_m[axis] + box.half_m[axis]
+            grid.append(np.arange(np.ceil(low / step), np.floor(high / step) + 1) * step)
+        self.pupil_m = np.stack(np.meshgrid(grid[0], grid[1]), axis=-1) @ box.to_pupil
+        self.field = self._complex(np.stack([self._in_pupil(one, wide, grid, per_metre) for one in seen]))
+        self._out_x = self._complex(np.exp(1j * per_metre * np.outer(grid[0], near[0])))
+        self._out_y = self._complex(np.exp(1j * per_metre * np.outer(near[1], grid[1])))
+        # The phase k r ds^2 / 2 along each axis: the pixels' directions are at right angles to a percent or two.
+        metric = window.direction.T @ window.direction * pupil.wavenumber * pupil.relief_m / 2
+        ways = [
+            np.exp(-1j * per_metre * np.outer(g, w))
+            * np.exp(1j * metric[a, a] * w * w)
+            / len(w)
+            @ np.exp(1j * per_metre * np.outer(w, g))
+            for a, (g, w) in enumerate(zip(grid, wide, strict=True))
+        ]
+        self._way_x, self._way_y = self._complex(ways[0].T), self._complex(ways[1])
+        in_x, in_y = (legendre.legvander((grid[a] - box.centre_m[a]) / box.half_m[a], degree) for a in (0, 1))
+        self._in_x, self._in_y = (self._real(np.asarray(table.T, np.float64)) for table in (in_x, in_y))
+        over_x, over_y = (_pixel_means(2 * half + 1, f) for half, f in zip(window.half, self._fine, strict=True))
+        self._over_x, self._over_y = self._real(over_x.T), self._real(over_y[::-1])  # row 0 is on top
+
+    def only(self, frames: Sequence[int]) -> SpotModel:
+        """Return the model of some of the frames."""
+        chosen = copy.copy(self)
+        chosen.field = self.field[list(frames)]
+        return chosen
+
+    @property
+    def frames(self) -> int:
+        """How many frames there are."""
+        return int(self.field.shape[0])
+
+    @staticmethod
+    def _offsets(pixels: int, fine: int, more: int = 0) -> Array:
+        """Return sample places in pixels from the middle one's centre: `fine` in each pixel, `more` at both ends."""
+        count = pixels * fine + 2 * more
+        return np.asarray((np.arange(count) - (count - 1) / 2) / fine)
+
+    def _in_pupil(self, seen: Seen, wide: list[Array], grid: list[Array], per_metre: float) -> NDArray[np.complex128]:
+        """Return U on the grid of q (rows up, columns), by way of the directions near the zone's own."""
+        q, values = seen
+        angle = (q @ np.linalg.inv(self.box.to_pupil)) * per_metre  # radians per pixel
+        # The transform's own samples have one at 0; an even number of ours has none.
+        counts = [len(w) for w in wide]
+        shift = [0.5 / f if n % 2 == 0 else 0.0 for f, n in zip(self._fine, counts, strict=True)]
+        source = (values * np.exp(1j * (angle @ shift))).astype(np.complex64)
+        steps = [np.mod(angle[:, a] / self._fine[a] + np.pi, 2 * np.pi) - np.pi for a in (0, 1)]
+        there = finufft.nufft2d1(
+            steps[1].astype(np.float32), steps[0].astype(np.float32), source, (counts[1], counts[0]),
+            eps=NUFFT_EPS, isign=1, nthreads=1,
+        )  # fmt: skip
+        back_x = np.exp(-1j * per_metre * np.outer(wide[0], grid[0])) / counts[0]
+        back_y = np.exp(-1j * per_metre * np.outer(grid[1], wide[1])) / counts[1]
+        return np.asarray(back_y @ there @ back_x)
+
+    def _real(self, values: Array) -> torch.Tensor:
+        return torch.from_numpy(np.ascontiguousarray(values, np.float32)).to(self.device)
+
+    def _complex(self, values: NDArray[np.complex128]) -> torch.Tensor:
+        return torch.from_numpy(np.ascontiguousarray(values, np.complex64)).to(self.device)
+
+    def transmission(self, shift_m: Array) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the pupil's transmission on the grid, and its derivatives (2, ...) per metre of `shift_m`."""
+        x, y = self._real(self.pupil_m[..., 0] - shift_m[0]), self._real(self.pupil_m[..., 1] - shift_m[1])
+        edge_m = max(self.pupil.edge_m, 1e-5)
+        r = torch.clamp(torch.hypot(x, y), min=1e-6)
+        z = torch.clamp((self.pupil.radius_m - r) / edge_m, -0.5, 0.5)
+        slope = torch.where(z.abs() < 0.5, 0.5 * np.pi / edge_m * torch.cos(np.pi * z), 0.0)
+        return 0.5 + 0.5 * torch.sin(np.pi * z), torch.stack([slope * x / r, slope * y / r])
+
+    def intensity(self, wavefront_rad: Array, log_amplitude: Array, shift_m: Array) -> torch.Tensor:
+        """Return the power on every pixel, (frames, rows, columns), row 0 on top.
+
+        `wavefront_rad` and `log_amplitude` (terms,) are coefficients of `products(degree)`, `shift_m` (2,) is q0.
+        """
+        aperture, _ = self.transmission(shift_m)
+        there = self._way_y @ (self._lit(wavefront_rad, log_amplitude) @ self._way_x)
+        return self._pixels(self._to_window(there * aperture).abs() ** 2)
+
+    def derivatives(
+        self, wavefront_rad: Array, log_amplitude: Array, shift_m: Array, *, degree: int
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return the intensity and its derivatives.
+
+        Returns
+        -------
+        intensity, by_products, by_shift
+            `by_products` (frames, 2, terms, rows, columns): by the wavefront's terms and the amplitude's, those up to
+            `degree`; `by_shift` (frames, 2, rows, columns) per metre.
+        """
+        aperture, slope = self.transmission(shift_m)
+        lit = self._lit(wavefront_rad, log_amplitude)
+        across = [(lit * self._in_x[i]) @ self._way_x for i in range(degree + 1)]
+        down = [self._way_y * self._in_y[j] for j in range(degree + 1)]
+        bare = down[0] @ across[0]
+        field = self._to_window(bare * aperture)
+        pairs = []
+        for i, j in products(degree):
+            change = field.conj() * self._to_window((down[j] @ across[i]) * aperture)
+            pairs.append(torch.stack([self._pixels(-2 * change.imag), self._pixels(2 * change.real)], dim=1))
+        moved = self._to_window(bare[:, None] * slope)
+        by_shift = self._pixels(2 * (field[:, None].conj() * moved).real)
+        return self._pixels(field.abs() ** 2), torch.stack(pairs, dim=2), by_shift
+
+    def _lit(self, wavefront_rad: Array, log_amplitude: Array) -> torch.Tensor:
+        """Return U exp(a + i W) on the pupil's grid, (frames, ...)."""
+        table = np.zeros((2, self.degree + 1, self.degree + 1))
+        for k, (i, j) in enumerate(products(self.degree)):
+            table[0, j, i], table[1, j, i] = wavefront_rad[k], log_amplitude[k]
+        phase, log = (self._in_y.T @ self._real(one) @ self._in_x for one in table)
+        return self.field * torch.polar(torch.exp(log), phase)
+
+    def _to_window(self, pupil: torch.Tensor) -> torch.Tensor:
+        return self._out_y @ (pupil @ self._out_x)
+
+    def _pixels(self, fine: torch.Tensor) -> torch.Tensor:
+        """Return the mean over each pixel, (..., rows, columns), row 0 on top, of samples with rows up."""
+        return self._over_y @ (fine @ self._over_x)
+
+
+def _pixel_means(pixels: int, fine: int) -> Array:
+    """Return the weights (pixels, pixels x fine + 2) of the mean over each pixel of a smooth function's samples.
+
+    A sample stands for f + f'' / 24 of its own width: over a pixel the second differences cancel but at its ends.
+    Plain sums are too sharp by a variance of 1 / (12 fine^2) pixels squared.
+    """
+    weights = np.zeros((pixels, pixels * fine + 2))
+    for pixel in range(pixels):
+        first, last = 1 + pixel * fine, (pixel + 1) * fine
+        weights[pixel, first : last + 1] += 1.0
+        for at, sign in ((first - 1, 1), (first, -1), (last, -1), (last + 1, 1)):
+            weights[pixel, at] += sign / 24
+    return weights / fine

@@ -1,0 +1,230 @@
+"""A spot in every zone of the field: directions, brightness, known defocus; and the frames that show them.
+
+Directions lie irregularly, so that a picture shifted by more than half a pitch is still told apart. A zone's pupil is
+what the panel lights of the eye's: often a strip, on a small panel nothing. The known defocus is scaled to it, so that
+every spot is as many pixels wide; brightness is shared out so that all reach the same counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from holocal.optics.bench import Bench, Panel
+from holocal.optics.phase_function import VirtualPoints
+from holocal.optics.spots import SpotWaves, analyse, derivative, spot_waves, synthesise
+from holocal.optics.zernike import zernike
+from holocal.records.facts import RigFacts
+
+Array = NDArray[np.float64]
+Levels = NDArray[np.uint8]
+
+JITTER = 0.15  # of the zones' pitch
+SPOT_PX = 20.0  # width of a defocused spot along the longer side of its pupil
+REACH_M = 2.2e-3  # of the pupil, from its centre: the bench's own may lie 0.6 mm off
+SOFT_M = 0.4e-3
+EDGE_M = 2e-4
+LEAST_LIT = 0.004  # of the pupil's area: a zone with less sends no light worth measuring
+LEAST_COUNT = 3  # zones
+MOST_BOOST = 12.0  # of a zone's amplitude over the brightest zone's
+_BLOCK = 8
+
+
+@dataclass(frozen=True)
+class SpotArray:
+    """The zones' spots on a nominal bench.
+
+    `field_tan` (zones, 2) directions in P; `waves` their phase functions; `lit` (zones,) the share of the pupil's area
+    that the panel lights; `centre_m` and `half_m` (zones, 2) the box round it; `flux` (zones,) what unit amplitude
+    sends through the pupil, in pixels of the panel; `bend_per_m` (zones,) the defocus, k b |q - centre|^2 / 2;
+    `amplitude` (zones,) 0 for a zone that is not lit; `pixels` (zones,) that a defocused spot covers.
+    """
+
+    facts: RigFacts
+    wavelength_m: float
+    field_tan: Array
+    waves: SpotWaves
+    lit: Array
+    centre_m: Array
+    half_m: Array
+    flux: Array
+    bend_per_m: Array
+    amplitude: Array
+    pixels: Array
+
+    @property
+    def panel(self) -> Panel:
+        """The panel's pixels."""
+        return self.waves.panel
+
+    @property
+    def on(self) -> NDArray[np.bool_]:
+        """Which zones are shown, (zones,)."""
+        return np.asarray(self.amplitude > 0)
+
+    @property
+    def pixel_tan(self) -> float:
+        """A camera pixel, in tangents."""
+        camera = self.facts.camera
+        return float(2 * np.tan(camera.field_rad[0] / 2) / camera.width)
+
+    def places_px(self, field_tan: Array | None = None) -> Array:
+        """Return where a rectilinear camera sees directions, (n, 2) column and row."""
+        tangents, camera = self.field_tan if field_tan is None else field_tan, self.facts.camera
+        return np.stack(
+            [
+                tangents[:, 0] / self.pixel_tan + (camera.width - 1) / 2,
+                (camera.height - 1) / 2 - tangents[:, 1] / self.pixel_tan,
+            ],
+            axis=-1,
+        )
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What a frame shows: `defocus` in units of the array's own, `phase_rad` (zones,) of the spots, and a correction.
+
+    `gain` (zones,) multiplies the array's amplitudes. `wavefront_rad` (zones, modes) of `noll` is added to each zone's
+    phase over the whole pupil.
+    """
+
+    defocus: float
+    phase_rad: Array
+    gain: Array
+    noll: tuple[int, ...] = ()
+    wavefront_rad: Array | None = None
+
+
+@lru_cache(maxsize=2)
+def spot_array(facts: RigFacts, wavelength_m: float, zones: int) -> SpotArray:
+    """Return zones x zones spots over the camera's field, made for a rig's nominal bench."""
+    camera = facts.camera
+    panel = Panel(facts.slm.width, facts.slm.height, facts.slm.pitch_m)
+    bench = Bench.nominal(pupil_diameter_m=facts.pupil_diameter_m, eye_relief_m=facts.eye_relief_m)
+    field_tan = zone_directions(zones, camera.field_rad)
+    waves = spot_waves(bench, panel, VirtualPoints.at(field_tan), wavelength_m=wavelength_m)
+    x, y = waves.block_grid(_BLOCK)
+    pupil = waves.pupil.on_grid(x, y)
+    passed = soft_disc(pupil, facts.pupil_diameter_m / 2, EDGE_M) ** 2
+    count = len(field_tan)
+    centre, half, area = np.zeros((count, 2)), np.full((count, 2), 1e-5), np.zeros(count)
+    for zone in range(count):
+        inside = passed[..., zone] > 0.1
+        if np.count_nonzero(inside) < LEAST_COUNT:
+            continue
+        q = pupil[:, :, zone]
+        low, high = q[inside].min(axis=0), q[inside].max(axis=0)
+        centre[zone], half[zone] = (low + high) / 2, np.maximum((high - low) / 2, 1e-5)
+        cell = np.abs(np.linalg.det(np.stack([np.gradient(q, axis=0), np.gradient(q, axis=1)], axis=-1)))
+        area[zone] = float(np.sum(passed[..., zone] * cell))
+    lit = area / (np.pi * (facts.pupil_diameter_m / 2) ** 2)
+    # A pixel's area: light that leaves at another frequency than it came with is fainter by its sinc.
+    turned = derivative(waves.turns, 0).on_grid(x, y) - panel.illumination_frequency_per_m[1]
+    flux = np.sum(passed * np.sinc(turned * panel.pitch_m) ** 2, axis=(0, 1)) * _BLOCK**2
+    pixel = 2 * np.tan(camera.field_rad[0] / 2) / camera.width
+    bend = SPOT_PX / 2 * pixel / half.max(axis=1)
+    widths = 2 * bend[:, None] * half / pixel + wavelength_m / (2 * half) / pixel + 1
+    pixels = np.prod(np.minimum(widths, 60.0), axis=1)
+    on = lit >= LEAST_LIT
+    amplitude = np.where(on, np.sqrt(pixels / np.maximum(flux, 1.0)), 0.0)
+    if on.any():
+        amplitude = np.minimum(amplitude / amplitude[on].min(), MOST_BOOST)
+    return SpotArray(
+        facts, wavelength_m, field_tan, waves, lit, centre, half, flux, bend, np.asarray(amplitude), pixels
+    )
+
+
+def zone_directions(zones: int, field_rad: tuple[float, float]) -> Array:
+    """Return the spots' tangents (zones^2, 2), from the top left; the same for every rig of this field."""
+    rng = np.random.default_rng(20261)
+    at = (2 * np.arange(zones) + 1 - zones) / zones
+    half = np.tan(np.asarray(field_rad) / 2)
+    grid = np.stack(np.meshgrid(at, at[::-1]), axis=-1).reshape(-1, 2)
+    return np.asarray((grid + rng.uniform(-JITTER, JITTER, grid.shape) * 2 / zones) * half)
+
+
+def soft_disc(pupil_m: Array, radius_m: float, edge_m: float) -> Array:
+    """Return the transmission of a disc with a raised cosine for a rim, at points (..., 2)."""
+    z = np.clip((radius_m - np.linalg.norm(pupil_m, axis=-1)) / edge_m, -0.5, 0.5)
+    return np.asarray(0.5 + 0.5 * np.sin(np.pi * z))
+
+
+def added_phase(array: SpotArray, recipe: Recipe, pupil_m: Array) -> Array:
+    """Return what a recipe adds to the phase functions, (n, zones) radians, at pupil points (n, zones, 2)."""
+    k, radius = 2 * np.pi / array.wavelength_m, array.facts.pupil_diameter_m / 2
+    away = np.sum((pupil_m - array.centre_m) ** 2, axis=-1)
+    phase = recipe.defocus * 0.5 * k * array.bend_per_m * away
+    if recipe.wavefront_rad is not None and recipe.noll:
+        basis = zernike(recipe.noll, pupil_m[..., 0] / radius, pupil_m[..., 1] / radius)
+        phase = phase + np.einsum("jnz,zj->nz", basis, recipe.wavefront_rad)
+    return np.asarray(phase)
+
+
+def recipe_levels(array: SpotArray, recipe: Recipe, response_rad: Array, device: str = "cpu") -> Levels:
+    """Return the levels that show a recipe: the phase of the sum of its waves, to the nearest level."""
+    from holocal.hologram.frame import phase_to_levels
+
+    waves = array.waves.with_phase(lambda q: added_phase(array, recipe, q))
+    amplitude = array.amplitude * recipe.gain * np.exp(1j * recipe.phase_rad)
+    radius = array.facts.pupil_diameter_m / 2
+    window_m = radius + REACH_M - 1.7e-3
+
+    def window(pupil_m: Array) -> Array:
+        return soft_disc(pupil_m, window_m, SOFT_M)
+
+    shown = synthesise(waves, amplitude, window, reach_m=window_m + SOFT_M / 2, device=device)
+    carrier = 2 * np.pi * np.mod(array.panel.illumination_frequency_per_m[1] * array.panel.y_m, 1.0)
+    phase = torch.angle(shown).cpu().numpy() - carrier[:, None].astype(np.float32)
+    count = len(response_rad)
+    nominal = np.array_equal(response_rad, np.arange(count) * (2 * np.pi / count))
+    return phase_to_levels(phase, None if nominal and count == 256 else response_rad)
+
+
+def light_of(array: SpotArray, levels: Levels, response_rad: Array, device: str = "cpu") -> torch.Tensor:
+    """Return the field that levels send from the panel, (height, width) complex64, beam and pixels' shape apart."""
+    carrier = 2 * np.pi * np.mod(array.panel.illumination_frequency_per_m[1] * array.panel.y_m, 1.0)
+    of_level = torch.from_numpy(np.exp(1j * np.asarray(response_rad)).astype(np.complex64)).to(device)
+    field = of_level[torch.from_numpy(levels.astype(np.int64)).to(device)]
+    return field * torch.from_numpy(np.exp(1j * carrier).astype(np.complex64)).to(device)[:, None]
+
+
+def seen_of(
+    array: SpotArray, levels: Levels, response_rad: Array, device: str = "cpu"
+) -> list[tuple[Array, NDArray[np.complex64]]]:
+    """Return for every zone what a frame's light holds of its spot: `analyse` of the levels shown."""
+    return analyse(array.waves, light_of(array, levels, response_rad, device), reach_m=REACH_M)
+
+
+def expected_counts(array: SpotArray, recipes: Sequence[Recipe], rate: float) -> list[Array]:
+    """Return the counts per second, (zones,), that a zone's pixels get on average under each recipe.
+
+    `rate` is the mean counts per second and pixel of a random pattern. The phase of a sum of many waves sends pi / 4 of
+    the light where the sum would.
+    """
+    unit = rate / max(float(np.mean(array.flux)), 1e-30)  # counts per second of a field of 1 px^2 at each panel pixel
+    found = []
+    for recipe in recipes:
+        amplitude = array.amplitude * recipe.gain
+        share = np.sqrt(np.pi / 4) * amplitude / np.sqrt(max(float(np.sum(amplitude**2)), 1e-30))
+        found.append(unit * share**2 * array.flux * _focus(array, recipe))
+    return found
+
+
+def _focus(array: SpotArray, recipe: Recipe) -> Array:
+    """Return a spot's mean intensity over that of its light spread evenly over all directions it can have, (zones,)."""
+    full = (array.wavelength_m / array.pixel_tan) ** 2  # the pupil's plane over which a pixel's light would spread
+    lit = np.maximum(4 * np.prod(array.half_m, axis=1), 1e-12)
+    sharp = np.prod(array.wavelength_m / (2 * array.half_m) / array.pixel_tan + 1, axis=1)
+    covered = array.pixels if abs(recipe.defocus) > 0.1 else sharp
+    panel_pixels = array.flux / np.maximum(np.sinc(0.5) ** 2, 1e-3)
+    return np.asarray(panel_pixels * (full / lit) / covered)
+
+
+def rescaled(recipe: Recipe, **changes: object) -> Recipe:
+    """Return a recipe with other values."""
+    return replace(recipe, **changes)  # type: ignore[arg-type]
