@@ -7,9 +7,9 @@ every spot is as many pixels wide; brightness is shared out so that all reach th
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from holocal.optics.bench import Bench, Panel
 from holocal.optics.phase_function import VirtualPoints
-from holocal.optics.spots import SpotWaves, analyse, derivative, spot_waves, synthesise
+from holocal.optics.spots import BLOCK, SpotWaves, analyse, derivative, spot_waves, synthesise
 from holocal.optics.zernike import zernike
 from holocal.records.facts import RigFacts
 
@@ -100,9 +100,21 @@ class Recipe:
     wavefront_rad: Array | None = None
 
 
-@lru_cache(maxsize=2)
+_MADE: OrderedDict[str, SpotArray] = OrderedDict()
+_KEPT = 2
+
+
 def spot_array(facts: RigFacts, wavelength_m: float, zones: int) -> SpotArray:
-    """Return zones x zones spots over the camera's field, made for a rig's nominal bench."""
+    """Return zones x zones spots over the camera's field, made for a rig's nominal bench; the last two are kept."""
+    key = repr((facts, wavelength_m, zones))
+    if key not in _MADE:
+        _MADE[key] = _spot_array(facts, wavelength_m, zones)
+        while len(_MADE) > _KEPT:
+            _MADE.popitem(last=False)
+    return _MADE[key]
+
+
+def _spot_array(facts: RigFacts, wavelength_m: float, zones: int) -> SpotArray:
     camera = facts.camera
     panel = Panel(facts.slm.width, facts.slm.height, facts.slm.pitch_m)
     bench = Bench.nominal(pupil_diameter_m=facts.pupil_diameter_m, eye_relief_m=facts.eye_relief_m)
@@ -200,31 +212,31 @@ def seen_of(
     return analyse(array.waves, light_of(array, levels, response_rad, device), reach_m=REACH_M)
 
 
-def expected_counts(array: SpotArray, recipes: Sequence[Recipe], rate: float) -> list[Array]:
-    """Return the counts per second, (zones,), that a zone's pixels get on average under each recipe.
+def expected_counts(array: SpotArray, seen: Sequence[tuple[Array, NDArray[np.complex64]]], rate: float) -> Array:
+    """Return the counts per second, (zones,), that the pixels of every defocused spot get on average.
 
-    `rate` is the mean counts per second and pixel of a random pattern. The phase of a sum of many waves sends pi / 4 of
-    the light where the sum would.
+    `seen` is what the frame's light holds of the zones, `rate` the mean counts per second and pixel of a random
+    pattern, whose every direction gets as many counts as pixels of the panel send light there.
     """
-    unit = rate / max(float(np.mean(array.flux)), 1e-30)  # counts per second of a field of 1 px^2 at each panel pixel
-    found = []
-    for recipe in recipes:
-        amplitude = array.amplitude * recipe.gain
-        share = np.sqrt(np.pi / 4) * amplitude / np.sqrt(max(float(np.sum(amplitude**2)), 1e-30))
-        found.append(unit * share**2 * array.flux * _focus(array, recipe))
-    return found
+    radius = array.facts.pupil_diameter_m / 2
+    unit = rate / max(float(np.mean(array.flux)), 1e-30)
+    counts = np.zeros(len(array.field_tan))
+    for zone in range(len(counts)):
+        if not array.on[zone]:
+            continue
+        pupil, values = seen[zone]
+        passed = soft_disc(pupil, radius, EDGE_M)
+        blocks = float(np.sum(passed**2))
+        if blocks < 1:
+            continue
+        cell = array.lit[zone] * np.pi * radius**2 / blocks  # of the pupil's area, per block
+        light = float(np.sum(np.abs(values * passed) ** 2)) * (array.wavelength_m / array.pixel_tan) ** 2 / cell
+        shape = array.flux[zone] / (blocks * BLOCK**2)  # the pixels' own sinc
+        counts[zone] = unit * light * shape / array.pixels[zone]
+    return counts
 
 
-def _focus(array: SpotArray, recipe: Recipe) -> Array:
-    """Return a spot's mean intensity over that of its light spread evenly over all directions it can have, (zones,)."""
-    full = (array.wavelength_m / array.pixel_tan) ** 2  # the pupil's plane over which a pixel's light would spread
-    lit = np.maximum(4 * np.prod(array.half_m, axis=1), 1e-12)
+def brighter_in_focus(array: SpotArray) -> float:
+    """Return how many times brighter a sharp spot's pixels are than a defocused one's, the median zone."""
     sharp = np.prod(array.wavelength_m / (2 * array.half_m) / array.pixel_tan + 1, axis=1)
-    covered = array.pixels if abs(recipe.defocus) > 0.1 else sharp
-    panel_pixels = array.flux / np.maximum(np.sinc(0.5) ** 2, 1e-3)
-    return np.asarray(panel_pixels * (full / lit) / covered)
-
-
-def rescaled(recipe: Recipe, **changes: object) -> Recipe:
-    """Return a recipe with other values."""
-    return replace(recipe, **changes)  # type: ignore[arg-type]
+    return float(np.median((array.pixels / sharp)[array.on]))

@@ -12,22 +12,21 @@ and of the deviations are is found from the data, by the largest evidence.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.polynomial import chebyshev, legendre
-from numpy.typing import NDArray
 
-from holocal.estimate.spot_fit import ZoneFit
 from holocal.estimate.spot_model import PupilBox, products
+from holocal.estimate.zone_data import ZoneFit
 from holocal.optics.bench import Array
 from holocal.optics.zernike import noll_to_nm, zernike
 
 DEGREE = 4  # over the field; a bench out of line needs 2 (docs/physics.md 10)
 # Of a Zernike coefficient of the whole pupil by its radial degree (from 2), and the share by the degree over the field.
-PRIOR_RAD, PRIOR_SHARE = (10.0, 3.0, 1.0, 0.4, 0.2), (1.0, 0.7, 0.3)
-HIGH = tuple(float(s) for s in np.geomspace(1e-4, 0.1, 7))  # shares of degree 3 over the field; 4 has half of it
-DEVIATIONS = tuple(float(s) for s in np.geomspace(1e-4, 0.03, 6))  # shares, of a zone of its own
+PRIOR_RAD, PRIOR_SHARE = (5.0, 1.0, 0.3, 0.1, 0.05), (1.0, 0.7, 0.3)
+HIGH = tuple(float(s) for s in np.geomspace(1e-4, 0.1, 5))  # shares of degree 3 over the field; 4 has half of it
+DEVIATIONS = tuple(float(s) for s in np.geomspace(1e-4, 0.03, 4))  # shares, of a zone of its own
 
 
 @dataclass(frozen=True)
@@ -38,26 +37,29 @@ class ZoneEvidence:
     weighted: Array
 
 
-def zone_evidence(fit: ZoneFit, box: PupilBox, degree: int, noll: Sequence[int], pupil_radius_m: float) -> ZoneEvidence:
-    """Return a zone's evidence on Noll coefficients; tilt and the modes above those wanted are integrated out.
+def modes_of(degree: int) -> tuple[int, ...]:
+    """Return all Noll indices of radial orders 2 to `degree`.
 
-    `degree` is that of the fit. The uncertainty is widened by the root of chi2 where that is above 1.
+    >>> modes_of(3)
+    (4, 5, 6, 7, 8, 9, 10)
     """
-    kinds = products(degree)[1:]
-    highest = max(noll_to_nm(j)[0] for j in noll)
-    kept = np.array([2 <= i + j <= highest for i, j in kinds])
+    return tuple(range(4, (degree + 1) * (degree + 2) // 2 + 1))
+
+
+def zone_evidence(fit: ZoneFit, box: PupilBox, degree: int, pupil_radius_m: float) -> ZoneEvidence:
+    """Return a zone's evidence on the coefficients of `modes_of(degree)`, of the fit's degree; tilt is integrated out.
+
+    All modes of the fit, those above the wanted ones too: over a lit part of the pupil they are not orthogonal, and
+    what is left out would leak. The uncertainty is widened by the root of chi2 where that is above 1.
+    """
+    kept = np.array([i + j >= 2 for i, j in products(degree)[1:]])
     information, weighted = fit.information / max(fit.chi2, 1.0), fit.weighted / max(fit.chi2, 1.0)
-    # integrate out: tilt has no prior; modes above have had theirs in the fit, here a wide one keeps the algebra sound
-    rest = information[np.ix_(~kept, ~kept)] + np.diag(np.where(_degrees(kinds)[~kept] > highest, 10.0, 1e-9))
+    rest = information[np.ix_(~kept, ~kept)] + 1e-9 * np.eye(int(np.count_nonzero(~kept)))
     cross = information[np.ix_(kept, ~kept)]
     own = information[np.ix_(kept, kept)] - cross @ np.linalg.solve(rest, cross.T)
     wanted = weighted[kept] - cross @ np.linalg.solve(rest, weighted[~kept])
-    matrix = legendre_of_noll(noll, box, degree, pupil_radius_m)[1:][kept]
+    matrix = legendre_of_noll(modes_of(degree), box, degree, pupil_radius_m)[1:][kept]
     return ZoneEvidence(matrix.T @ own @ matrix, matrix.T @ wanted)
-
-
-def _degrees(kinds: Sequence[tuple[int, int]]) -> NDArray[np.int64]:
-    return np.array([i + j for i, j in kinds])
 
 
 def legendre_of_noll(noll: Sequence[int], box: PupilBox, degree: int, pupil_radius_m: float) -> Array:
@@ -90,6 +92,19 @@ class FieldModel:
     high: float
     deviation: float
 
+    def only(self, noll: Sequence[int]) -> FieldModel:
+        """Return the model of some of the modes."""
+        at = [self.noll.index(j) for j in noll]
+        return replace(
+            self,
+            noll=tuple(noll),
+            coefficients=self.coefficients[at],
+            zones=self.zones[:, at],
+            zone_covariance=self.zone_covariance[:, at][:, :, at],
+            predicted=self.predicted[:, at],
+            predicted_covariance=self.predicted_covariance[:, at][:, :, at],
+        )
+
     def at(self, field_tan: Array) -> Array:
         """Return the smooth part of the coefficients, (n, modes) radians, at tangents (n, 2)."""
         return field_terms(field_tan, self.half_tan) @ self.coefficients.T
@@ -112,17 +127,24 @@ def fit_field(
     mean, covariance = problem.solve(high, deviation)
     modes, terms = problem.modes, problem.terms
     zones, spread = problem.zones_of(mean, covariance)
-    predicted, predicted_covariance = np.empty_like(zones), np.empty_like(spread)
+    predicted, predicted_covariance = zones.copy(), spread.copy()
     for z, said in enumerate(evidence):
-        if said is None:
-            predicted[z], predicted_covariance[z] = zones[z], spread[z]
-            continue
-        without = problem.zones_of(*problem.solve(high, deviation, without=z))
-        predicted[z], predicted_covariance[z] = without[0][z], without[1][z]
+        if said is not None:
+            # What is left without the zone's own part: Woodbury's formula for taking it away again.
+            taken = np.linalg.inv(np.eye(modes) - spread[z] @ said.information)
+            predicted[z] = taken @ (zones[z] - spread[z] @ said.weighted)
+            predicted_covariance[z] = taken @ spread[z]
     return FieldModel(
-        tuple(noll), half_tan, mean[: modes * terms].reshape(modes, terms), zones, spread, predicted,
-        predicted_covariance, high, deviation,
-    )  # fmt: skip
+        tuple(noll),
+        half_tan,
+        mean[: modes * terms].reshape(modes, terms),
+        zones,
+        spread,
+        predicted,
+        predicted_covariance,
+        high,
+        deviation,
+    )
 
 
 class _Problem:
@@ -179,14 +201,10 @@ class _Problem:
         half = np.linalg.solve(factor, self.weighted)
         return float(0.5 * np.sum(np.log(prior)) - np.sum(np.log(np.diag(factor))) + 0.5 * half @ half)
 
-    def solve(self, high: float, deviation: float, without: int | None = None) -> tuple[Array, Array]:
-        """Return mean and covariance of b and the deviations, of all zones or all but one."""
-        information, weighted = self.information, self.weighted
-        if without is not None and (one := self.said[without]) is not None:
-            information, weighted = information.copy(), weighted.copy()
-            self._add(information, weighted, without, one, -1.0)
-        covariance = np.linalg.inv(information + np.diag(self._prior(high, deviation)))
-        return covariance @ weighted, covariance
+    def solve(self, high: float, deviation: float) -> tuple[Array, Array]:
+        """Return mean and covariance of b and the deviations."""
+        covariance = np.linalg.inv(self.information + np.diag(self._prior(high, deviation)))
+        return np.asarray(covariance @ self.weighted), np.asarray(covariance)
 
     def zones_of(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
         """Return every zone's coefficients (zones, modes) and their covariance (zones, modes, modes)."""

@@ -80,11 +80,11 @@ def register(picture: Array) -> Registration:
     sigma = SIGMA_SHARE * width
     # The speckle is averaged over a blob, and the root keeps the brightest blobs from deciding alone.
     smooth = np.sqrt(np.maximum(_blurred(picture, sigma), 0))
-    shift = _best_shift(smooth, np.sqrt(_blurred(blob_image(height, width), sigma)))
+    shift = best_shift(smooth, np.sqrt(_blurred(blob_image(height, width), sigma)))
     predicted, used = places + shift, np.zeros(len(places), bool)
     seen = predicted
     for _ in range(3):
-        seen, weight = _centroids(picture, predicted, WINDOW_SIGMAS * sigma)
+        seen, weight = centroids(picture, predicted, WINDOW_SIGMAS * sigma)
         used = weight > BRIGHT * np.nanmax(np.append(weight, 1e-300))
         coefficients, used = _robust(places, seen, used, width, height)
         moved = _terms(_scaled(places, width, height))[:, : len(coefficients)] @ coefficients
@@ -114,7 +114,7 @@ def _blurred(picture: Array, sigma: float) -> Array:
     return np.asarray(gaussian_filter(np.asarray(picture, np.float64), sigma / 2, mode="constant"))
 
 
-def _best_shift(picture: Array, pattern: Array) -> Array:
+def best_shift(picture: Array, pattern: Array) -> Array:
     """Return the whole-pixel shift (column, row) of the pattern that correlates best with the picture.
 
     Up to 30 % of the field: beyond, what is left of the pattern in the picture is too little to be sure.
@@ -130,7 +130,7 @@ def _best_shift(picture: Array, pattern: Array) -> Array:
     return np.array([offsets[1][column], offsets[0][row]], float)
 
 
-def _centroids(picture: Array, near: Array, radius: float) -> tuple[Array, Array]:
+def centroids(picture: Array, near: Array, radius: float) -> tuple[Array, Array]:
     """Return the centroids (n, 2) of discs around places, and the light in each, (n,); none for discs over the edge."""
     height, width = picture.shape
     reach = int(np.ceil(radius))

@@ -2,137 +2,25 @@
 
 Counts are Poisson plus read noise: the variance of a pixel is read variance + gain x signal + (flicker x signal)^2, as
 the pre-flight measured it (photon transfer). Fitted along, each with a prior: amplitude over the pupil (low orders),
-where the pupil lies, power and tilt of each frame, the camera's blur. Wavefront modes above those wanted are fitted too,
-with a prior; left out they leak into those wanted (docs/physics.md 10).
+where the pupil lies, power and tilt of each frame, the camera's blur. So are wavefront modes above those wanted; left
+out they leak into those wanted (docs/physics.md 10).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from holocal.estimate.spot_model import SpotModel, products
+from holocal.estimate.zone_data import Layout, Noise, Priors, ZoneData, ZoneFit
 from holocal.optics.bench import Array
 
 MOST_ITERATIONS, MOST_TRIES = 12, 8
+Prior = tuple[Array, Array]  # precision and centre of every parameter
+
 ENOUGH = 0.1  # of chi-square: an iteration that gains less was the last
-
-
-@dataclass(frozen=True)
-class Noise:
-    """The variance law of counts: `read_variance` + `gain` s + `flicker_squared` s^2, s the signal in counts."""
-
-    read_variance: float
-    gain: float
-    flicker_squared: float = 0.0
-
-    def variance(self, signal: Array) -> Array:
-        """Return the variance of counts whose expected signal is this."""
-        lit = np.maximum(signal, 0.0)
-        return np.asarray(self.read_variance + self.gain * lit + self.flicker_squared * lit**2)
-
-
-@dataclass(frozen=True)
-class Priors:
-    """Standard deviations of what is fitted along: radians, logarithms, metres, pixels."""
-
-    wavefront_rad: float = 3.0  # of every mode
-    higher_rad: float = 0.3  # of modes above `wanted_degree`
-    log_amplitude: float = 0.5
-    log_flux: float = 5.0
-    shift_m: float = 0.4e-3
-    log_power: float = 0.01
-    tilt_px: float = 0.03
-    blur_px2: float = 0.3
-    affine: float = 0.02
-
-
-@dataclass(frozen=True)
-class ZoneData:
-    """What the camera saw of a zone: `counts` (frames, rows, columns) less the dark level, `good` where they count.
-
-    `scale` (frames,) is what the model's power is multiplied by: exposure times a guess of the flux.
-    """
-
-    counts: Array
-    good: NDArray[np.bool_]
-    scale: Array
-
-
-@dataclass(frozen=True)
-class Layout:
-    """Where each parameter stands in the vector."""
-
-    terms: int
-    amplitude_terms: int
-    frames: int
-
-    @property
-    def wavefront(self) -> slice:
-        """Terms 1.. of the wavefront; piston is not seen."""
-        return slice(0, self.terms - 1)
-
-    @property
-    def amplitude(self) -> slice:
-        """Terms of the logarithm of the amplitude; the first is half the logarithm of the flux."""
-        return slice(self.wavefront.stop, self.wavefront.stop + self.amplitude_terms)
-
-    @property
-    def shift(self) -> slice:
-        """Where the pupil lies, in millimetres."""
-        return slice(self.amplitude.stop, self.amplitude.stop + 2)
-
-    @property
-    def power(self) -> slice:
-        """Logarithm of each frame's power, the first frame's left out."""
-        return slice(self.shift.stop, self.shift.stop + self.frames - 1)
-
-    @property
-    def tilt(self) -> slice:
-        """Each frame's own shift in pixels (x, y), the first frame's left out."""
-        return slice(self.power.stop, self.power.stop + 2 * (self.frames - 1))
-
-    @property
-    def blur(self) -> int:
-        """Half the variance of the blur, pixels squared."""
-        return int(self.tilt.stop)
-
-    @property
-    def affine(self) -> slice:
-        """How the picture is stretched and turned about the window's middle: d(x, y) / d(x, y), row by row."""
-        return slice(self.blur + 1, self.blur + 5)
-
-    @property
-    def count(self) -> int:
-        """Length of the vector."""
-        return int(self.affine.stop)
-
-
-@dataclass(frozen=True)
-class ZoneFit:
-    """A zone's fit: `vector` and its `covariance` (Laplace, prior included) in the order of `layout`.
-
-    `information` is that of the wavefront's terms alone, from the data: nuisances are integrated out with their prior,
-    the wavefront's own prior is left out. `weighted` is information times what the data alone want.
-    `chi2` is the reduced chi-square, `light` the signal's sum in counts.
-    """
-
-    layout: Layout
-    vector: Array
-    covariance: Array
-    information: Array
-    weighted: Array
-    chi2: float
-    pixels: int
-    light: float
-    converged: bool
-
-    @property
-    def wavefront_rad(self) -> Array:
-        """Legendre coefficients of the wavefront, (terms - 1,), without piston."""
-        return self.vector[self.layout.wavefront]
 
 
 class ZoneProblem:
@@ -235,13 +123,21 @@ class ZoneProblem:
         start[: layout.shift.stop] = vector[: layout.shift.stop]
         return start
 
-    def fit(self, start: Array, precision: Array, *, blur_px: float = 0.0, degree: int | None = None) -> ZoneFit:
+    def fit(
+        self,
+        start: Array,
+        precision: Array,
+        *,
+        centre: Array | None = None,
+        blur_px: float = 0.0,
+        degree: int | None = None,
+    ) -> ZoneFit:
         """Return the most likely parameters by Levenberg and Marquardt's method.
 
         Parameters
         ----------
-        precision
-            Of the normal prior round 0.
+        precision, centre
+            Of the normal prior; its centre is 0 unless given.
         blur_px
             Data and model are blurred by so much: wide basins first. Tilt, blur and stretch of the frames then wait.
         degree
@@ -251,7 +147,8 @@ class ZoneProblem:
         highest = self.model.degree if degree is None else degree
         moving = self._moving(highest, fine=kernels is None)
         vector, damping = start, 1e-3
-        state = self._at(vector, precision, kernels, highest)
+        prior = (precision, np.zeros(self.layout.count) if centre is None else centre)
+        state = self._at(vector, prior, kernels, highest)
         converged = False
         for _ in range(MOST_ITERATIONS):
             step, value = np.zeros(self.layout.count), np.inf
@@ -259,7 +156,7 @@ class ZoneProblem:
                 damped = state.matrix[np.ix_(moving, moving)]
                 damped = damped + damping * np.diag(np.diag(damped))
                 step[moving] = np.linalg.solve(damped, state.right[moving])
-                value = self._objective(self.expected(vector + step), vector + step, precision, kernels, state.sigma)
+                value = self._objective(self.expected(vector + step), vector + step, prior, kernels, state.sigma)
                 if value < state.objective:
                     break
                 damping *= 8
@@ -268,11 +165,11 @@ class ZoneProblem:
                 converged = True
                 break
             vector, damping = vector + step, max(damping / 6, 1e-7)
-            state = self._at(vector, precision, kernels, highest)
+            state = self._at(vector, prior, kernels, highest)
             if gain < ENOUGH:
                 converged = True
                 break
-        return self._result(vector, precision, state, converged)
+        return self._result(vector, prior, state, converged)
 
     def _moving(self, highest: int, *, fine: bool) -> NDArray[np.bool_]:
         moving = np.ones(self.layout.count, np.bool_)
@@ -288,14 +185,14 @@ class ZoneProblem:
         return np.asarray(np.sqrt(variance))
 
     def _objective(
-        self, expected: Array, vector: Array, precision: Array, kernels: tuple[Array, Array] | None, sigma: Array
+        self, expected: Array, vector: Array, prior: Prior, kernels: tuple[Array, Array] | None, sigma: Array
     ) -> float:
         """Return chi-square with the prior's, for given errors: they follow the model from step to step, not within."""
         difference = _blurred(np.where(self.data.good, self.data.counts - expected, 0.0), kernels)
         residual = (difference / sigma)[self.data.good]
-        return float(residual @ residual + np.sum(precision * vector**2))
+        return float(residual @ residual) + _penalty(vector, prior)
 
-    def _at(self, vector: Array, precision: Array, kernels: tuple[Array, Array] | None, highest: int) -> _Linearised:
+    def _at(self, vector: Array, prior: Prior, kernels: tuple[Array, Array] | None, highest: int) -> _Linearised:
         expected, slopes = self.derivatives(vector, highest)
         sigma, good = self._sigma(expected, kernels), self.data.good
         difference = _blurred(np.where(good, self.data.counts - expected, 0.0), kernels)
@@ -303,22 +200,22 @@ class ZoneProblem:
         residual = (difference / sigma)[good]
         data = weighted @ weighted.T
         return _Linearised(
-            float(residual @ residual + np.sum(precision * vector**2)),
+            float(residual @ residual) + _penalty(vector, prior),
             sigma,
-            data + np.diag(precision),
-            weighted @ residual - precision * vector,
+            data + np.diag(prior[0]),
+            weighted @ residual - prior[0] * (vector - prior[1]),
             data,
             float(residual @ residual),
             residual.size,
         )
 
-    def _result(self, vector: Array, precision: Array, state: _Linearised, converged: bool) -> ZoneFit:
+    def _result(self, vector: Array, prior: Prior, state: _Linearised, converged: bool) -> ZoneFit:
         layout, own = self.layout, self.layout.wavefront
         others = np.arange(own.stop, layout.count)
         rest, cross = state.matrix[np.ix_(others, others)], state.data[own][:, others]
         information = state.data[own, own] - cross @ np.linalg.solve(rest, cross.T)
         # A last linear step, without the wavefront's own prior: what the data alone want.
-        pull = state.right[own] + precision[own] * vector[own]
+        pull = state.right[own] + (prior[0] * (vector - prior[1]))[own]
         weighted = information @ vector[own] + pull - cross @ np.linalg.solve(rest, state.right[others])
         dof = max(state.pixels - layout.count, 1)
         light = float(np.sum(np.where(self.data.good, self.data.counts, 0.0)))
@@ -344,13 +241,36 @@ class _Linearised:
 STAGES = ((4.0, 2), (2.0, 3), (1.0, 4))  # blur in pixels, degree of the wavefront
 
 
-def coarse_to_fine(problem: ZoneProblem, priors: Priors, wanted_degree: int) -> ZoneFit:
-    """Return the fit by way of blurred pictures, few modes and two frames, so that large aberrations are caught."""
+def coarse_to_fine(
+    problem: ZoneProblem,
+    priors: Priors,
+    wanted_degree: int,
+    *,
+    pupil_m: Array | None = None,
+    pupil_sigma_m: float | None = None,
+) -> ZoneFit:
+    """Return the fit by way of blurred pictures, few modes and two frames, so that large aberrations are caught.
+
+    `pupil_m` (2,) is where the pupil is believed to lie, with an error of `pupil_sigma_m`.
+    """
+    if pupil_sigma_m is not None:
+        priors = replace(priors, shift_m=pupil_sigma_m)
     pair = problem.of_frames((0, 1)) if problem.model.frames > 2 else problem
     vector = pair.start()
+    if pupil_m is not None:
+        vector[pair.layout.shift] = 1e3 * pupil_m
+    middle = np.zeros(pair.layout.count)
+    middle[pair.layout.shift] = vector[pair.layout.shift]
     for blur_px, degree in STAGES:
-        vector = pair.fit(vector, pair.prior(priors, wanted_degree), blur_px=blur_px, degree=degree).vector
-    return problem.fit(problem.begun_at(vector, pair.layout), problem.prior(priors, wanted_degree))
+        precision = pair.prior(priors, wanted_degree)
+        vector = pair.fit(vector, precision, centre=middle, blur_px=blur_px, degree=degree).vector
+    whole = np.zeros(problem.layout.count)
+    whole[problem.layout.shift] = middle[pair.layout.shift]
+    return problem.fit(problem.begun_at(vector, pair.layout), problem.prior(priors, wanted_degree), centre=whole)
+
+
+def _penalty(vector: Array, prior: Prior) -> float:
+    return float(np.sum(prior[0] * (vector - prior[1]) ** 2))
 
 
 def _slopes(pictures: Array) -> tuple[Array, Array, Array]:

@@ -8,8 +8,8 @@ the bench adds to it. With U(q) that field over the points q at which the zone's
 
 W the wavefront (a delay, radians) and a the logarithm of the amplitude, both belonging to the panel's points; F the way
 from the panel's image to the pupil r in front of it (a phase k r ds^2 / 2 on the directions); T the pupil's
-transmission, q0 where it lies. (W and a put in the pupil's plane instead leave 0.1 rad of defocus at 4K: the beam's own fall-off is
-mistaken for it. F left out, the pupil's rim leaves 0.03 rad.)
+transmission, q0 where it lies. (W and a put in the pupil's plane instead leave 0.1 rad of defocus at 4K: the beam's own
+fall-off is mistaken for it. F left out, the pupil's rim leaves 0.03 rad.)
 
 W and a are Legendre products over the box that the zone's light fills, along the camera's pixel axes: all
 transforms are separable, matrix products, and one set of them serves the derivatives by W and by a.

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from holocal.loop.devices import Frame
+from holocal.loop.reference import Reference
 from holocal.records.facts import RigFacts
 
 
@@ -166,6 +167,18 @@ class Procedure(Protocol[State]):
 
     def conclude(self, state: State, frames: tuple[Frame, ...]) -> Conclusion:
         """Return the result, "after" measured on the verification's frames only."""
+        ...
+
+
+@runtime_checkable
+class ToldOfCamera(Protocol):
+    """What a procedure adds when it builds on what the pre-flight found of the camera.
+
+    The runner tells it once, after `start`: dark level, noise law, hot pixels, and a random pattern's light.
+    """
+
+    def with_camera(self, state: Any, reference: Reference) -> Any:
+        """Return the first state, told."""
         ...
 
 

@@ -24,7 +24,7 @@ from holocal.loop.gates import Verdict
 from holocal.loop.preflight import Check, Expectations, preflight, refuse_failed
 from holocal.loop.preflight.checks import failed
 from holocal.loop.preflight.expectations import NOTHING_EXPECTED
-from holocal.loop.procedure import AgainstTruth, Conclusion, Judgement, Outcome, Plan, Procedure, Shot
+from holocal.loop.procedure import AgainstTruth, Conclusion, Judgement, Outcome, Plan, Procedure, Shot, ToldOfCamera
 from holocal.loop.record import RunRecord
 from holocal.loop.shooting import Shooter, Taken
 from holocal.loop.signals import StopRequest, stop_requests
@@ -196,6 +196,8 @@ class _Loop:
         if found is None:
             self.observer.waiting("the first pattern")
             state = self.procedure.start(self.facts, self.calibration, self.parameters, self.seed)
+            if isinstance(self.procedure, ToldOfCamera) and self.shooter.reference is not None:
+                state = self.procedure.with_camera(state, self.shooter.reference)
             self.record.checkpoint(state, step=0, frames=0, seconds=self.seconds())
             judgement = Judgement(Outcome.CONTINUE, "")
         else:

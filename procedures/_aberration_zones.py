@@ -1,0 +1,285 @@
+"""The zones' windows, and what all frames together say of their wavefronts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from holocal.estimate.field_model import FieldModel, ZoneEvidence, fit_field, modes_of, zone_evidence
+from holocal.estimate.spot_fit import ZoneProblem
+from holocal.estimate.spot_model import Pupil, PupilBox, Seen, SpotModel, Window
+from holocal.estimate.spot_places import SpotPlaces
+from holocal.estimate.zone_data import Noise, Priors, ZoneData, ZoneFit
+from holocal.estimate.zone_fits import fit_zones, pupil_place
+from holocal.optics.zernike import noll_to_nm
+from procedures._aberration_spots import EDGE_M, REACH_M, SpotArray
+
+Array = NDArray[np.float64]
+
+MARGIN_PX = 5  # of a window round a spot: what an aberration of 4 rad throws out
+BOX_MARGIN_M = 0.15e-3  # light of the panel's edges spreads so far by the window's own resolution
+SPAN_M = 0.5e-3  # beyond the pupil's nominal rim its light may come from
+ABOVE = 1  # degrees of the wavefront that are fitted above those wanted
+LEAST_LIGHT = 30.0  # of a spot, over the noise of its window: below, the zone is dark
+LARGEST_CHI2 = 3.0  # times the median (at least 1): above, a zone's fit is not believed
+LARGEST_OFF = 100.0  # chi-square per mode between a zone and what the others say of it
+REFINED_AT = 1e-3  # of stretch: a window's directions are set right and its fit made again
+
+
+@dataclass(frozen=True)
+class Shown:
+    """The frames of an estimate: `pictures` (n, height, width) counts less the dark level, `exposure_s` (n,), and what
+    the panel's light held of every zone in each."""
+
+    pictures: NDArray[np.float32]
+    exposure_s: Array
+    seen: Sequence[Sequence[Seen]]
+
+
+@dataclass(frozen=True)
+class CameraNoise:
+    """`noise` of counts, `usable` pixels (height, width), and the count of a saturated pixel."""
+
+    noise: Noise
+    usable: NDArray[np.bool_]
+    full_scale: int
+    dark: Array  # (frames,) level that was subtracted
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What frames say of all zones.
+
+    `fits` per zone, None for one that could not be fitted, `reason` why, or why it is not believed; `windows`, `boxes`
+    likewise; `field` joins them; `pupil_m` (2,) where the pupil lies.
+    """
+
+    fits: tuple[ZoneFit | None, ...]
+    windows: tuple[Window | None, ...]
+    boxes: tuple[PupilBox | None, ...]
+    models: tuple[SpotModel | None, ...]
+    problems: tuple[ZoneProblem | None, ...]
+    reasons: tuple[str, ...]
+    field: FieldModel
+    degree: int
+    pupil_m: Array
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """Which zones were fitted and are believed."""
+        return np.array([not reason for reason in self.reasons])
+
+
+def windows_of(array: SpotArray, places: SpotPlaces) -> tuple[list[Window | None], list[str]]:
+    """Return every zone's window, and a sentence for each that has none."""
+    camera = array.facts.camera
+    centred = array.places_px() - np.array([(camera.width - 1) / 2, (camera.height - 1) / 2])
+    jacobian = places.jacobian(centred)
+    found: list[Window | None] = []
+    reasons = []
+    for zone in range(len(array.field_tan)):
+        window, reason = None, ""
+        if not array.on[zone]:
+            reason = f"the panel lights {array.lit[zone]:.1%} of the pupil: too little to measure"
+        else:
+            extent = array.bend_per_m[zone] * array.half_m[zone] / array.pixel_tan
+            spread = array.wavelength_m / (2 * array.half_m[zone]) / array.pixel_tan
+            half = np.ceil(extent + 0.6 * np.minimum(spread, 15.0) + MARGIN_PX).astype(int)
+            column, row = (round(float(v)) for v in places.seen[zone])
+            inside = half[0] <= column < camera.width - half[0] and half[1] <= row < camera.height - half[1]
+            if inside:
+                window = Window(
+                    column, row, (int(half[0]), int(half[1])), directions(array, array.field_tan[zone], jacobian[zone])
+                )
+            else:
+                reason = f"its spot is seen at column {column}, row {row}: outside the picture"
+        found.append(window)
+        reasons.append(reason)
+    return found, reasons
+
+
+def directions(array: SpotArray, tangent: Array, jacobian: Array) -> Array:
+    """Return what takes pixels (right, up) to direction sines of the nominal bench, (2, 2).
+
+    `jacobian` (2, 2) is d seen / d place in (columns, rows down), both in pixels.
+    """
+    flip = np.diag([1.0, -1.0])
+    to_place = flip @ np.linalg.inv(jacobian) @ flip  # pixels right and up, seen -> as a rectilinear camera has them
+    sines = tangent / np.sqrt(1 + tangent @ tangent)
+    per_tangent = (np.eye(2) - np.outer(sines, sines)) / np.sqrt(1 + tangent @ tangent)
+    return np.asarray(per_tangent @ to_place * array.pixel_tan)
+
+
+def estimate(
+    array: SpotArray,
+    places: SpotPlaces,
+    shown: Shown,
+    camera: CameraNoise,
+    noll: tuple[int, ...],
+    *,
+    before: Estimate | None = None,
+    device: str = "cpu",
+) -> Estimate:
+    """Return what frames say of all zones; `before` gives windows and a place to start from."""
+    wanted = max(noll_to_nm(j)[0] for j in noll)
+    degree = wanted + ABOVE
+    priors = Priors()
+    if before is None:
+        windows, reasons = windows_of(array, places)
+    else:
+        windows = list(before.windows)
+        reasons = ["" if window is not None else said for window, said in zip(windows, before.reasons, strict=True)]
+    parts = [_problem(array, windows[z], z, shown, camera, degree, device) for z in range(len(windows))]
+    for zone, part in enumerate(parts):
+        if part is not None and _darkness(part[2]) < LEAST_LIGHT:
+            parts[zone], reasons[zone] = None, "no light is seen where its spot should be"
+    problems = [None if part is None else part[2] for part in parts]
+    started: list[Array | None] | None = None
+    if before is not None:
+        started = [
+            None if fit is None or problem is None else problem.begun_at(fit.vector, fit.layout)
+            for fit, problem in zip(before.fits, problems, strict=True)
+        ]
+    fits = fit_zones(problems, priors, wanted, started)
+    for zone, fit in enumerate(fits):  # where the window's directions were off, once more with the right ones
+        window = windows[zone]
+        if fit is None or window is None or np.max(np.abs(fit.vector[fit.layout.affine])) < REFINED_AT:
+            continue
+        windows[zone] = turned(window, fit.vector[fit.layout.affine])
+    changed = [z for z, part in enumerate(parts) if part is not None and windows[z] is not part[0].window]
+    for zone in changed:
+        old, fit = parts[zone], fits[zone]
+        parts[zone] = part = _problem(array, windows[zone], zone, shown, camera, degree, device)
+        assert old is not None
+        assert fit is not None
+        assert part is not None
+        vector = fit.vector.copy()
+        vector[fit.layout.affine] = 0.0
+        vector[fit.layout.wavefront] = rebased(vector[fit.layout.wavefront], old[1], part[1], degree)
+        problems[zone] = part[2]
+        fits[zone] = ZoneFit(
+            fit.layout, vector, fit.covariance, fit.information, fit.weighted, fit.chi2, fit.pixels, fit.light, True
+        )
+    if changed:
+        again = [fit.vector if z in changed and fit is not None else None for z, fit in enumerate(fits)]
+        refitted = fit_zones([problems[z] if z in changed else None for z in range(len(fits))], priors, wanted, again)
+        fits = [new if new is not None else old for new, old in zip(refitted, fits, strict=True)]
+    models = [None if part is None else part[0] for part in parts]
+    boxes = [None if part is None else part[1] for part in parts]
+    place = pupil_place(fits)
+    field, reasons = joined(array, fits, boxes, reasons, degree, noll)
+    return Estimate(
+        tuple(fits),
+        tuple(windows),
+        tuple(boxes),
+        tuple(models),
+        tuple(problems),
+        tuple(reasons),
+        field,
+        degree,
+        np.zeros(2) if place is None else place,
+    )
+
+
+def turned(window: Window, affine: Array) -> Window:
+    """Return a window whose directions take in a picture's stretch."""
+    return Window(window.column, window.row, window.half, window.direction @ (np.eye(2) - affine.reshape(2, 2)))
+
+
+def rebased(terms: Array, old: PupilBox, new: PupilBox, degree: int) -> Array:
+    """Return a wavefront's terms (without piston) over another box."""
+    rng = np.random.default_rng(0)
+    inside = rng.uniform(-1, 1, (8 * (len(terms) + 1), 2)) * old.half_m + old.centre_m
+    pupil = inside @ old.to_pupil
+    values = old.legendre(pupil, degree)[:, 1:] @ terms
+    return np.asarray(np.linalg.lstsq(new.legendre(pupil, degree), values, rcond=None)[0][1:])
+
+
+def joined(
+    array: SpotArray,
+    fits: Sequence[ZoneFit | None],
+    boxes: Sequence[PupilBox | None],
+    reasons: Sequence[str],
+    degree: int,
+    noll: tuple[int, ...],
+) -> tuple[FieldModel, list[str]]:
+    """Return the field's model from the zones that are believed, and the reasons of those that are not."""
+    said = list(reasons)
+    known = [fit.chi2 for fit in fits if fit is not None]
+    limit = LARGEST_CHI2 * max(float(np.median(known)) if known else 1.0, 1.0)
+    for zone, fit in enumerate(fits):
+        if fit is not None and not said[zone] and not fit.chi2 <= limit:
+            said[zone] = f"its pictures do not fit: chi-square {fit.chi2:.1f} per pixel; the limit is {limit:.1f}"
+    radius = array.facts.pupil_diameter_m / 2
+    evidence: list[ZoneEvidence | None] = []
+    for fit, box, reason in zip(fits, boxes, said, strict=True):
+        usable = fit is not None and box is not None and not reason
+        evidence.append(zone_evidence(fit, box, degree, radius) if usable else None)  # type: ignore[arg-type]
+    half = np.tan(np.asarray(array.facts.camera.field_rad) / 2)
+    half_tan = (float(half[0]), float(half[1]))
+    while True:
+        field = fit_field(evidence, array.field_tan, half_tan, modes_of(degree))
+        off = [_off(field, evidence, zone) for zone in range(len(evidence))]
+        worst = int(np.argmax(off))
+        if off[worst] <= LARGEST_OFF or sum(e is not None for e in evidence) <= 4:
+            return field.only(noll), said
+        said[worst] = f"it disagrees with all other zones: chi-square {off[worst]:.0f} per mode"
+        evidence[worst] = None
+
+
+def _off(field: FieldModel, evidence: Sequence[ZoneEvidence | None], zone: int) -> float:
+    """Return how far a zone's own evidence is from what the others predict, chi-square per mode."""
+    one = evidence[zone]
+    if one is None:
+        return 0.0
+    values, vectors = np.linalg.eigh(one.information)
+    sure = values > 1e-3 * np.max(values)
+    own = vectors[:, sure].T @ one.weighted / values[sure]
+    difference = own - vectors[:, sure].T @ field.predicted[zone]
+    spread = np.diag(1 / values[sure]) + vectors[:, sure].T @ field.predicted_covariance[zone] @ vectors[:, sure]
+    return float(difference @ np.linalg.solve(spread, difference)) / int(np.count_nonzero(sure))
+
+
+Part = tuple[SpotModel, PupilBox, ZoneProblem]
+
+
+def _problem(
+    array: SpotArray,
+    window: Window | None,
+    zone: int,
+    shown: Shown,
+    camera: CameraNoise,
+    degree: int,
+    device: str,
+) -> Part | None:
+    if window is None:
+        return None
+    facts = array.facts
+    pupil = Pupil(facts.pupil_diameter_m / 2, EDGE_M, facts.eye_relief_m, array.wavelength_m)
+    seen = [frame[zone] for frame in shown.seen]
+    q = seen[0][0]
+    q = q[np.linalg.norm(q, axis=1) <= min(REACH_M, pupil.radius_m + SPAN_M)]
+    if len(q) < 16:
+        return None
+    box = PupilBox.around(q, window, BOX_MARGIN_M)
+    model = SpotModel(window, seen, box, pupil, degree=degree, device=device)
+    counts = np.stack([window.cut(picture) for picture in shown.pictures]).astype(np.float64)
+    good = np.stack(
+        [
+            (window.cut(picture) < camera.full_scale - dark - 0.5) & window.cut(camera.usable)
+            for picture, dark in zip(shown.pictures, camera.dark, strict=True)
+        ]
+    )
+    scale = np.asarray(shown.exposure_s, np.float64) / float(shown.exposure_s[0])
+    return model, box, ZoneProblem(model, ZoneData(counts, good, scale), camera.noise)
+
+
+def _darkness(problem: ZoneProblem) -> float:
+    """Return a spot's light over the noise of its window."""
+    data = problem.data
+    light = float(np.sum(np.where(data.good, data.counts, 0.0)))
+    pixels = max(int(np.count_nonzero(data.good)), 1)
+    return light / float(np.sqrt(problem.noise.read_variance * pixels))
