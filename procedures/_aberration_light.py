@@ -37,6 +37,8 @@ _KEPT = 8  # frames whose levels and light are kept: 8 MB and some tens of MB ea
 _LEVELS: OrderedDict[str, Levels] = OrderedDict()
 _SEEN: OrderedDict[str, list[Seen]] = OrderedDict()
 FEWEST_SPOTS = 2
+LEAST_SHARE = 0.25  # of the picture's light, that lies in the spots found: 0.6 to 0.8 on the simulated benches
+SPOT_REACH_PX = 14
 
 
 def array_of(state: State) -> SpotArray:
@@ -137,13 +139,24 @@ def window_peaks(state: State, places: SpotPlaces, picture: Array) -> Array:
     peaks = np.zeros(len(array.field_tan))
     for zone in np.flatnonzero(array.on):
         column, row = (round(float(v)) for v in places.seen[zone])
-        reach = 14
+        reach = SPOT_REACH_PX
         part = picture[
             max(row - reach, 0) : max(row + reach + 1, 0), max(column - reach, 0) : max(column + reach + 1, 0)
         ]
         if part.size and 0 <= column < camera.width and 0 <= row < camera.height:
             peaks[zone] = float(np.quantile(part, 1 - min(8.0 / part.size, 0.5)))
     return peaks
+
+
+def light_in_spots(places: SpotPlaces, picture: Array) -> float:
+    """Return the share of a picture's light that lies round the spots that were found; 0 where there is no light."""
+    inside = np.zeros(picture.shape, np.bool_)
+    for column, row in places.seen[places.used]:
+        c, r = round(float(column)), round(float(row))
+        low = max(r - SPOT_REACH_PX, 0), max(c - SPOT_REACH_PX, 0)
+        inside[low[0] : max(r + SPOT_REACH_PX + 1, 0), low[1] : max(c + SPOT_REACH_PX + 1, 0)] = True
+    total = float(picture.sum())
+    return float(picture[inside].sum()) / total if total > 0 else 0.0
 
 
 def places_in(state: State, frame: int) -> SpotPlaces:
@@ -182,13 +195,15 @@ def with_first(state: State, frame: Frame) -> State:
         guess = float(np.clip(frame.exposure_s * factor, camera.exposure_min_s, camera.exposure_max_s))
         if guess != frame.exposure_s:
             return replace(state, searched=tried.searched, step=tried.step, guess_s=guess)
-    if np.count_nonzero(places.used) < FEWEST_SPOTS:
+    share = light_in_spots(places, picture)
+    if np.count_nonzero(places.used) < FEWEST_SPOTS or not share >= LEAST_SHARE:
         raise RefusedError(
-            f"{np.count_nonzero(places.used)} of {int(array.on.sum())} spots were found in the camera's picture.",
+            f"{np.count_nonzero(places.used)} of {int(array.on.sum())} spots were found in the camera's picture, with "
+            f"{share:.0%} of its light; the limits are {FEWEST_SPOTS} and {LEAST_SHARE:.0%}.",
             why="Without them no zone can be told from another.",
             fix="Check that the camera sees the field, and that its picture is neither mirrored nor turned far.",
-            measured=int(np.count_nonzero(places.used)),
-            limit=FEWEST_SPOTS,
+            measured={"spots": int(np.count_nonzero(places.used)), "share": share},
+            limit={"spots": FEWEST_SPOTS, "share": LEAST_SHARE},
             code="no-spots",
         )
     seen = array.on & (peaks > 0.02 * brightest)

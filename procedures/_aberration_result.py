@@ -151,11 +151,11 @@ def conclusion(state: State, fresh: State) -> Conclusion:
         before_map=mosaic_of(state, found),
         after_map=mosaic_of(fresh, check),
         map_units=units | {"before": "counts", "after": "counts"},
+        map_metadata={"wavelength_nm": chosen.wavelength_nm},
         extent_deg=extent,
         extra={
             "mode": "model",
             "wavelength_nm": chosen.wavelength_nm,
-            "wavelength_m": chosen.wavelength_nm * 1e-9,
             "noll": list(chosen.noll),
             "field": {
                 "half_tan": list(half_tan_of(state)),

@@ -3,7 +3,7 @@
 A hologram shows a spot in each zone, with a known defocus. The picture of every spot is modelled through the levels
 that were really shown (`holocal.estimate.spot_model`), the wavefront of each zone is fitted to all its pictures, and
 the zones are joined over the field (`holocal.estimate.field_model`). The correction is then shown, and what it leaves
-is measured on frames that no estimate has seen. `mode=search` does without a model, `mode=sweep` shows one polynomial.
+is measured on frames that no estimate has seen.
 
 ======  ===========================================================================================
 frame   shows
@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,18 +50,12 @@ class Parameters(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    mode: Literal["model", "search", "sweep"] = "model"
     zones: int = Field(default=5, ge=2, le=15)
     noll_max: int = Field(default=15, ge=4, le=36)
     wavelength_nm: float = Field(default=515.0, gt=0.0)
     target_median_rad: float = Field(default=0.05, gt=0.0)
     target_worst_rad: float = Field(default=0.15, gt=0.0)
     max_steps: int = Field(default=3, ge=2, le=10)
-    posterior: bool = False
-    max_frames: int = Field(default=125, ge=20, le=10_000)  # of the search
-    sweep_noll: int = Field(default=4, ge=2, le=36)
-    sweep_rad: float = Field(default=4.0, gt=0.0, le=100.0)
-    sweep_steps: int = Field(default=9, ge=3, le=101)
     device: str = "cpu"
 
     @property
@@ -103,8 +97,8 @@ class State:
     wavefront_rad: float
 
 
-class Model:
-    """The default mode, as a procedure (see `holocal.loop.procedure.Procedure`)."""
+class Aberration:
+    """The procedure `aberration` (see `holocal.loop.procedure.Procedure`)."""
 
     name = "aberration"
     parameters_model = Parameters
@@ -283,7 +277,3 @@ def verified(state: State, frames: Sequence[Frame]) -> State:
     for number, (defocus, frame) in enumerate(zip(VERIFIED, frames, strict=True)):
         fresh = taken(fresh, frame, defocus, (VERIFICATION, number))
     return fresh
-
-
-class Aberration(Model):
-    """The procedure `aberration`."""

@@ -11,7 +11,10 @@ response        the phase of every level of a panel, from the phases of some
 posterior       samples of what measurements leave possible, round a maximum-likelihood fit
 coverage        whether errors are as large as they are said to be
 spot_model      what a camera window shows of a spot, through the known frame
+spot_places     where the camera sees the zones' spots
 spot_fit        the wavefront of a zone, with nuisances, coarse to fine
+zone_data       what that fit is made of: noise, priors, counts, parameters, result
+zone_fits       the fits of all zones
 field_model     Zernike coefficients over the field, from all zones together
 lit_pupil       what of a wavefront a cut pupil shows, and a bias that spreads its spot
 mirrored_pictures

@@ -111,6 +111,7 @@ class Conclusion:
     before_map: NDArray[np.float32]
     after_map: NDArray[np.float32]
     map_units: Mapping[str, str] = field(default_factory=dict)
+    map_metadata: Mapping[str, Any] = field(default_factory=dict)  # further metadata of the maps' file
     extent_deg: tuple[float, float, float, float] | None = None
     extra: dict[str, Any] = field(default_factory=dict)  # further keys of result.json
     figures: tuple[Figure, ...] = ()

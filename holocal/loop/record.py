@@ -163,7 +163,7 @@ class RunRecord:
 
     def conclusion(self, conclusion: Conclusion, result: Mapping[str, Any]) -> None:
         """Write the maps, the figures and ``result.json``."""
-        shared = {"extent_deg": conclusion.extent_deg, "run": self.directory.name}
+        shared = {"extent_deg": conclusion.extent_deg, "run": self.directory.name, **conclusion.map_metadata}
         units = dict(conclusion.map_units)
         for name, picture in (("before", conclusion.before_map), ("after", conclusion.after_map)):
             path = self.directory / f"{name}.exr"
