@@ -93,7 +93,7 @@ def seen_in(state: State, recipe: Recipe) -> list[Seen]:
     key = _key(state, recipe)
     if key not in _SEEN:
         levels = levels_of(state, recipe)
-        _SEEN[key] = seen_of(array_of(state), levels, state.response_rad, state.parameters.device)
+        _SEEN[key] = seen_of(array_of(state), levels, recipe, state.response_rad, state.parameters.device)
         while len(_SEEN) > _KEPT:
             _SEEN.popitem(last=False)
     return _SEEN[key]

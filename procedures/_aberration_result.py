@@ -15,6 +15,7 @@ from holocal.estimate.zone_data import Noise
 from holocal.loop.procedure import Conclusion
 from holocal.optics.bench import Bench, Panel
 from holocal.optics.zernike import zernike
+from procedures._aberration_directions import lit_grid
 from procedures._aberration_light import (
     array_of,
     correction_of,
@@ -25,7 +26,7 @@ from procedures._aberration_light import (
     seen_in,
 )
 from procedures._aberration_pictures import extent_of, figures_of, maps_of, mosaic_of
-from procedures._aberration_spots import EDGE_M, SpotArray, soft_disc
+from procedures._aberration_spots import SpotArray
 from procedures._aberration_truth import residuals_rad
 from procedures._aberration_zones import CameraNoise, Estimate, Shown, estimate
 
@@ -35,7 +36,8 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Extent = tuple[float, float, float, float]
 
-MODEL_ERROR = 0.02  # of a pixel, relative: what the model of a picture leaves beside noise (docs/physics.md 10)
+# What the model of a picture leaves beside noise (docs/physics.md 10): of a pixel, and of the brightest pixel.
+MODEL_ERROR, FAINT_ERROR = 0.01, 0.001
 UNKNOWN_RAD = 99.0
 _LAST: dict[str, Estimate] = {}
 
@@ -56,10 +58,13 @@ def _estimate_of(state: State, before: Estimate | None) -> Estimate:
     count = len(state.pictures)
     dark = np.array([dark_level(state, float(s)) for s in state.exposures_s])
     pictures = state.pictures.astype(np.float32) - dark[:, None, None].astype(np.float32)
-    shown = Shown(pictures, state.exposures_s, [seen_in(state, recipe_taken(state, i)) for i in range(count)])
+    shown = Shown(
+        pictures, state.exposures_s, state.defocus, [seen_in(state, recipe_taken(state, i)) for i in range(count)]
+    )
     known, full = state.reference, state.facts.camera.full_scale
     flicker = MODEL_ERROR**2 + (0.0 if known is None else known.flicker_squared)
-    noise = Noise(1.0, full / 10_000, flicker) if known is None else Noise(known.read_variance, known.gain, flicker)
+    read_variance, gain = (1.0, full / 10_000) if known is None else (known.read_variance, known.gain)
+    noise = Noise(read_variance, gain, flicker, FAINT_ERROR)
     usable = np.ones(pictures.shape[1:], np.bool_) if known is None else known.usable
     camera = CameraNoise(noise, usable, full, dark)
     where = places_in(state, 0)
@@ -89,11 +94,8 @@ def _lit_basis(array: SpotArray, zone: int, noll: tuple[int, ...], pupil_m: Arra
 
     `pupil_m` (2,) is where the pupil lies; a hologram of the nominal bench fills its own place for it.
     """
-    side = np.linspace(-1, 1, 31)
-    grid = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2) * array.half_m[zone] + array.centre_m[zone]
+    grid, root = lit_grid(array, zone, pupil_m)
     radius = array.facts.pupil_diameter_m / 2
-    weight = (soft_disc(grid, radius, EDGE_M) * soft_disc(grid - pupil_m, radius, EDGE_M)) ** 2
-    root = np.sqrt(weight / max(float(weight.sum()), 1e-300))
     plane = np.concatenate([np.ones((len(grid), 1)), grid / radius], axis=1) * root[:, None]
     modes = zernike(noll, grid[:, 0] / radius, grid[:, 1] / radius).T * root[:, None]
     left = modes - plane @ np.linalg.lstsq(plane, modes, rcond=None)[0]

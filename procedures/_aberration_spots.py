@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from holocal.optics.bench import Bench, Panel
-from holocal.optics.phase_function import VirtualPoints
+from holocal.optics.phase_function import VirtualPoints, exact_phase
 from holocal.optics.spots import BLOCK, SpotWaves, analyse, derivative, spot_waves, synthesise
 from holocal.optics.zernike import zernike
 from holocal.records.facts import RigFacts
@@ -32,7 +32,24 @@ EDGE_M = 2e-4
 LEAST_LIT = 0.004  # of the pupil's area: a zone with less sends no light worth measuring
 LEAST_COUNT = 3  # zones
 MOST_BOOST = 12.0  # of a zone's amplitude over the brightest zone's
+NEARBY_M, NEARBY_COUNT = 2.5e-3, 80  # points of the panel whose light says how directions differ
 _BLOCK = 8
+
+
+@dataclass(frozen=True)
+class Nearby:
+    """How directions near a zone's own differ from it, on the nominal bench.
+
+    `relief_m` (zones, 2, 2) is R = d q / d s at q = 0: q the pupil point of light from a place of
+    the panel, s direction sines; `relief_slope` (zones, 2, 2, 2) d R_ij / d q_k; `envelope` (zones, 2) the logarithmic
+    slope by s of the amplitude that the panel's pixels send there; `block_m` (zones, 2, 2) how far q moves with a
+    block of `analyse`: d q_i for a block along axis j of the panel.
+    """
+
+    relief_m: Array
+    relief_slope: Array
+    envelope: Array
+    block_m: Array
 
 
 @dataclass(frozen=True)
@@ -56,6 +73,7 @@ class SpotArray:
     bend_per_m: Array
     amplitude: Array
     pixels: Array
+    nearby: Nearby
 
     @property
     def panel(self) -> Panel:
@@ -136,8 +154,10 @@ def _spot_array(facts: RigFacts, wavelength_m: float, zones: int) -> SpotArray:
         area[zone] = float(np.sum(passed[..., zone] * cell))
     lit = area / (np.pi * (facts.pupil_diameter_m / 2) ** 2)
     # A pixel's area: light that leaves at another frequency than it came with is fainter by its sinc.
-    turned = derivative(waves.turns, 0).on_grid(x, y) - panel.illumination_frequency_per_m[1]
-    flux = np.sum(passed * np.sinc(turned * panel.pitch_m) ** 2, axis=(0, 1)) * _BLOCK**2
+    flux = np.full(passed.shape, float(_BLOCK**2))
+    for axis, own in zip((1, 0), panel.illumination_frequency_per_m, strict=True):
+        flux *= np.sinc((derivative(waves.turns, axis).on_grid(x, y) - own) * panel.pitch_m) ** 2
+    flux = np.sum(passed * flux, axis=(0, 1))
     pixel = 2 * np.tan(camera.field_rad[0] / 2) / camera.width
     bend = SPOT_PX / 2 * pixel / half.max(axis=1)
     widths = 2 * bend[:, None] * half / pixel + wavelength_m / (2 * half) / pixel + 1
@@ -147,8 +167,49 @@ def _spot_array(facts: RigFacts, wavelength_m: float, zones: int) -> SpotArray:
     if on.any():
         amplitude = np.minimum(amplitude / amplitude[on].min(), MOST_BOOST)
     return SpotArray(
-        facts, wavelength_m, field_tan, waves, lit, centre, half, flux, bend, np.asarray(amplitude), pixels
-    )
+        facts, wavelength_m, field_tan, waves, lit, centre, half, flux, bend, np.asarray(amplitude), pixels,
+        _nearby(bench, waves, field_tan, wavelength_m, facts.pupil_diameter_m / 2),
+    )  # fmt: skip
+
+
+def _nearby(bench: Bench, waves: SpotWaves, field_tan: Array, wavelength_m: float, radius_m: float) -> Nearby:
+    panel, count, step = waves.panel, len(field_tan), 1e-3
+    half = panel.half_size_m
+    line = np.linspace(-1, 1, 25)
+    x = np.stack(np.meshgrid(line * half[0], line * half[1]), axis=-1).reshape(-1, 2)
+    sines = field_tan / np.sqrt(1 + np.sum(field_tan**2, axis=1, keepdims=True))
+
+    def pupil(offset: Array) -> Array:
+        moved = sines + offset
+        tangent = moved / np.sqrt(1 - np.sum(moved**2, axis=1, keepdims=True))
+        return exact_phase(bench, VirtualPoints.at(tangent), x[:, None], wavelength_m=wavelength_m).pupil_m
+
+    q = pupil(np.zeros(2))
+    by_s = np.stack([(pupil(step * e) - pupil(-step * e)) / (2 * step) for e in np.eye(2)], axis=-1)
+    passed = soft_disc(q, radius_m, EDGE_M) ** 2
+    frequency = np.stack([derivative(waves.turns, axis).at(x) for axis in (1, 0)], axis=-1)
+    turns = (frequency - np.asarray(panel.illumination_frequency_per_m)) * panel.pitch_m
+    relief, slope, envelope = np.zeros((count, 2, 2)), np.zeros((count, 2, 2, 2)), np.zeros((count, 2))
+    block_m = np.zeros((count, 2, 2))
+    for zone in range(count):
+        away = np.linalg.norm(q[:, zone], axis=1)
+        lit = np.argsort(away)[: max(np.count_nonzero(away < NEARBY_M), NEARBY_COUNT)]
+        terms = np.concatenate([np.ones((len(lit), 1)), q[lit, zone]], axis=1)
+        found = np.linalg.lstsq(terms, by_s[lit, zone].reshape(len(lit), 4), rcond=None)[0]
+        relief[zone] = found[0].reshape(2, 2)
+        slope[zone] = np.moveaxis(found[1:].reshape(2, 2, 2), 0, -1)
+        # d f / d s = -(d q / d x)^T / wavelength: light turned by ds leaves the panel with another frequency.
+        by_x = np.linalg.lstsq(np.concatenate([np.ones((len(lit), 1)), x[lit]], axis=1), q[lit, zone], rcond=None)[0]
+        middle = np.average(turns[lit, zone], axis=0, weights=passed[lit, zone] + 1e-9)
+        block_m[zone] = by_x[1:].T * BLOCK * panel.pitch_m
+        envelope[zone] = -(_log_sinc_slope(middle) * panel.pitch_m @ by_x[1:]) / wavelength_m
+    return Nearby(relief, slope, envelope, block_m)
+
+
+def _log_sinc_slope(turns: Array) -> Array:
+    """Return d ln sinc(u) / d u, u in turns over a pixel."""
+    safe = np.where(np.abs(turns) < 1e-4, 1e-4, turns)
+    return np.asarray(np.pi / np.tan(np.pi * safe) - 1 / safe)
 
 
 def zone_directions(zones: int, field_rad: tuple[float, float]) -> Array:
@@ -206,10 +267,20 @@ def light_of(array: SpotArray, levels: Levels, response_rad: Array, device: str 
 
 
 def seen_of(
-    array: SpotArray, levels: Levels, response_rad: Array, device: str = "cpu"
+    array: SpotArray, levels: Levels, recipe: Recipe, response_rad: Array, device: str = "cpu"
 ) -> list[tuple[Array, NDArray[np.complex64]]]:
-    """Return for every zone what a frame's light holds of its spot: `analyse` of the levels shown."""
-    return analyse(array.waves, light_of(array, levels, response_rad, device), reach_m=REACH_M)
+    """Return for every zone what a frame's light holds of its spot: `analyse` of the levels shown.
+
+    What the pixels' areas send of a spot's light, with the phase that the recipe adds, is in its values, less the slope
+    over directions (`Nearby.envelope`), which is the picture's (`Window.envelope`).
+    """
+    sent = array.waves.with_phase(lambda q: added_phase(array, recipe, q))
+    found = analyse(array.waves, light_of(array, levels, response_rad, device), reach_m=REACH_M, sent=sent)
+    back = []
+    for zone, (pupil, values) in enumerate(found):
+        turn = -recipe.defocus * array.bend_per_m[zone] * (pupil - array.centre_m[zone])
+        back.append((pupil, (values * np.exp(-turn @ array.nearby.envelope[zone])).astype(np.complex64)))
+    return back
 
 
 def expected_counts(array: SpotArray, seen: Sequence[tuple[Array, NDArray[np.complex64]]], rate: float) -> Array:
@@ -231,8 +302,7 @@ def expected_counts(array: SpotArray, seen: Sequence[tuple[Array, NDArray[np.com
             continue
         cell = array.lit[zone] * np.pi * radius**2 / blocks  # of the pupil's area, per block
         light = float(np.sum(np.abs(values * passed) ** 2)) * (array.wavelength_m / array.pixel_tan) ** 2 / cell
-        shape = array.flux[zone] / (blocks * BLOCK**2)  # the pixels' own sinc
-        counts[zone] = unit * light * shape / array.pixels[zone]
+        counts[zone] = unit * light / array.pixels[zone]
     return counts
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,27 +15,32 @@ from holocal.estimate.spot_places import SpotPlaces
 from holocal.estimate.zone_data import Noise, Priors, ZoneData, ZoneFit
 from holocal.estimate.zone_fits import fit_zones, pupil_place
 from holocal.optics.zernike import noll_to_nm
+from procedures._aberration_directions import better_jacobians, turned, windows_of
 from procedures._aberration_spots import EDGE_M, REACH_M, SpotArray
 
 Array = NDArray[np.float64]
 
-MARGIN_PX = 5  # of a window round a spot: what an aberration of 4 rad throws out
 BOX_MARGIN_M = 0.15e-3  # light of the panel's edges spreads so far by the window's own resolution
 SPAN_M = 0.5e-3  # beyond the pupil's nominal rim its light may come from
 ABOVE = 1  # degrees of the wavefront that are fitted above those wanted
 LEAST_LIGHT = 30.0  # of a spot, over the noise of its window: below, the zone is dark
 LARGEST_CHI2 = 3.0  # times the median (at least 1): above, a zone's fit is not believed
 LARGEST_OFF = 100.0  # chi-square per mode between a zone and what the others say of it
-REFINED_AT = 1e-3  # of stretch: a window's directions are set right and its fit made again
+# Prior of a picture's stretch once the fits have placed the spots: by many, and by too few for a curved map.
+AFFINE_PLACED, AFFINE_BY_FEW = 0.003, 0.01
 
 
 @dataclass(frozen=True)
 class Shown:
-    """The frames of an estimate: `pictures` (n, height, width) counts less the dark level, `exposure_s` (n,), and what
-    the panel's light held of every zone in each."""
+    """The frames of an estimate.
+
+    `pictures` (n, height, width) counts less the dark level, `exposure_s` (n,), `defocus` (n,) in units of the array's,
+    and what the panel's light held of every zone in each.
+    """
 
     pictures: NDArray[np.float32]
     exposure_s: Array
+    defocus: Array
     seen: Sequence[Sequence[Seen]]
 
 
@@ -73,46 +78,6 @@ class Estimate:
         return np.array([not reason for reason in self.reasons])
 
 
-def windows_of(array: SpotArray, places: SpotPlaces) -> tuple[list[Window | None], list[str]]:
-    """Return every zone's window, and a sentence for each that has none."""
-    camera = array.facts.camera
-    centred = array.places_px() - np.array([(camera.width - 1) / 2, (camera.height - 1) / 2])
-    jacobian = places.jacobian(centred)
-    found: list[Window | None] = []
-    reasons = []
-    for zone in range(len(array.field_tan)):
-        window, reason = None, ""
-        if not array.on[zone]:
-            reason = f"the panel lights {array.lit[zone]:.1%} of the pupil: too little to measure"
-        else:
-            extent = array.bend_per_m[zone] * array.half_m[zone] / array.pixel_tan
-            spread = array.wavelength_m / (2 * array.half_m[zone]) / array.pixel_tan
-            half = np.ceil(extent + 0.6 * np.minimum(spread, 15.0) + MARGIN_PX).astype(int)
-            column, row = (round(float(v)) for v in places.seen[zone])
-            inside = half[0] <= column < camera.width - half[0] and half[1] <= row < camera.height - half[1]
-            if inside:
-                window = Window(
-                    column, row, (int(half[0]), int(half[1])), directions(array, array.field_tan[zone], jacobian[zone])
-                )
-            else:
-                reason = f"its spot is seen at column {column}, row {row}: outside the picture"
-        found.append(window)
-        reasons.append(reason)
-    return found, reasons
-
-
-def directions(array: SpotArray, tangent: Array, jacobian: Array) -> Array:
-    """Return what takes pixels (right, up) to direction sines of the nominal bench, (2, 2).
-
-    `jacobian` (2, 2) is d seen / d place in (columns, rows down), both in pixels.
-    """
-    flip = np.diag([1.0, -1.0])
-    to_place = flip @ np.linalg.inv(jacobian) @ flip  # pixels right and up, seen -> as a rectilinear camera has them
-    sines = tangent / np.sqrt(1 + tangent @ tangent)
-    per_tangent = (np.eye(2) - np.outer(sines, sines)) / np.sqrt(1 + tangent @ tangent)
-    return np.asarray(per_tangent @ to_place * array.pixel_tan)
-
-
 def estimate(
     array: SpotArray,
     places: SpotPlaces,
@@ -144,31 +109,26 @@ def estimate(
             for fit, problem in zip(before.fits, problems, strict=True)
         ]
     fits = fit_zones(problems, priors, wanted, started)
-    for zone, fit in enumerate(fits):  # where the window's directions were off, once more with the right ones
-        window = windows[zone]
-        if fit is None or window is None or np.max(np.abs(fit.vector[fit.layout.affine])) < REFINED_AT:
-            continue
-        windows[zone] = turned(window, fit.vector[fit.layout.affine])
-    changed = [z for z, part in enumerate(parts) if part is not None and windows[z] is not part[0].window]
-    for zone in changed:
-        old, fit = parts[zone], fits[zone]
-        parts[zone] = part = _problem(array, windows[zone], zone, shown, camera, degree, device)
-        assert old is not None
-        assert fit is not None
-        assert part is not None
-        vector = fit.vector.copy()
-        vector[fit.layout.affine] = 0.0
-        vector[fit.layout.wavefront] = rebased(vector[fit.layout.wavefront], old[1], part[1], degree)
-        problems[zone] = part[2]
-        fits[zone] = ZoneFit(
-            fit.layout, vector, fit.covariance, fit.information, fit.weighted, fit.chi2, fit.pixels, fit.light, True
-        )
-    if changed:
-        again = [fit.vector if z in changed and fit is not None else None for z, fit in enumerate(fits)]
-        refitted = fit_zones([problems[z] if z in changed else None for z in range(len(fits))], priors, wanted, again)
-        fits = [new if new is not None else old for new, old in zip(refitted, fits, strict=True)]
-    models = [None if part is None else part[0] for part in parts]
+    place = pupil_place(fits)
     boxes = [None if part is None else part[1] for part in parts]
+    better = better_jacobians(array, places, windows, boxes, fits, degree, np.zeros(2) if place is None else place)
+    if before is None and better is not None:  # the windows' directions set right, and the fits made again
+        windows = turned(array, windows, better[0])
+        started = [None] * len(windows)
+        for zone, (old, fit) in enumerate(zip(parts, fits, strict=True)):
+            if old is None or fit is None:
+                continue
+            parts[zone] = part = _problem(array, windows[zone], zone, shown, camera, degree, device)
+            if part is None:
+                continue
+            problems[zone], boxes[zone] = part[2], part[1]
+            vector = fit.vector.copy()
+            vector[fit.layout.affine] = 0.0
+            vector[fit.layout.wavefront] = rebased(vector[fit.layout.wavefront], old[1], part[1], degree)
+            started[zone] = vector
+        affine = AFFINE_PLACED if better[1] else AFFINE_BY_FEW
+        fits = fit_zones(problems, replace(priors, affine=affine), wanted, started)
+    models = [None if part is None else part[0] for part in parts]
     place = pupil_place(fits)
     field, reasons = joined(array, fits, boxes, reasons, degree, noll)
     return Estimate(
@@ -182,11 +142,6 @@ def estimate(
         degree,
         np.zeros(2) if place is None else place,
     )
-
-
-def turned(window: Window, affine: Array) -> Window:
-    """Return a window whose directions take in a picture's stretch."""
-    return Window(window.column, window.row, window.half, window.direction @ (np.eye(2) - affine.reshape(2, 2)))
 
 
 def rebased(terms: Array, old: PupilBox, new: PupilBox, degree: int) -> Array:
@@ -258,14 +213,17 @@ def _problem(
     if window is None:
         return None
     facts = array.facts
-    pupil = Pupil(facts.pupil_diameter_m / 2, EDGE_M, facts.eye_relief_m, array.wavelength_m)
+    pupil = Pupil(facts.pupil_diameter_m / 2, EDGE_M, array.wavelength_m)
     seen = [frame[zone] for frame in shown.seen]
     q = seen[0][0]
     q = q[np.linalg.norm(q, axis=1) <= min(REACH_M, pupil.radius_m + SPAN_M)]
     if len(q) < 16:
         return None
     box = PupilBox.around(q, window, BOX_MARGIN_M)
-    model = SpotModel(window, seen, box, pupil, degree=degree, device=device)
+    model = SpotModel(
+        window, seen, box, pupil, degree=degree, device=device,
+        bends_per_m=shown.defocus * array.bend_per_m[zone], bent_about_m=array.centre_m[zone],
+    )  # fmt: skip
     counts = np.stack([window.cut(picture) for picture in shown.pictures]).astype(np.float64)
     good = np.stack(
         [

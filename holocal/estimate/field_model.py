@@ -25,8 +25,8 @@ from holocal.optics.zernike import noll_to_nm, zernike
 DEGREE = 4  # over the field; a bench out of line needs 2 (docs/physics.md 10)
 # Of a Zernike coefficient of the whole pupil by its radial degree (from 2), and the share by the degree over the field.
 PRIOR_RAD, PRIOR_SHARE = (5.0, 1.0, 0.3, 0.1, 0.05), (1.0, 0.7, 0.3)
-HIGH = tuple(float(s) for s in np.geomspace(1e-4, 0.1, 5))  # shares of degree 3 over the field; 4 has half of it
-DEVIATIONS = tuple(float(s) for s in np.geomspace(1e-4, 0.03, 4))  # shares, of a zone of its own
+HIGH = tuple(float(s) for s in np.geomspace(1e-4, 0.03, 5))  # shares of degree 3 over the field; 4 has half of it
+DEVIATIONS = tuple(float(s) for s in np.geomspace(1e-4, 4e-3, 4))  # shares, of a zone of its own
 
 
 @dataclass(frozen=True)

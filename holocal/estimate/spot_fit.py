@@ -100,6 +100,8 @@ class ZoneProblem:
         stretch = np.stack([slope_x * x, slope_x * y, slope_y * x, slope_y * y])
         moved = plain - tilt[:, 0] * slope_x - tilt[:, 1] * slope_y + vector[layout.blur] * bend
         moved -= np.tensordot(vector[layout.affine], stretch, axes=1)
+        curved = np.tensordot(self.model.window.curve, np.stack([x * x + 0 * y, x * y, y * y + 0 * x]), axes=1)
+        moved += curved[0] * slope_x + curved[1] * slope_y
         return moved, slope_x, slope_y, bend, stretch
 
     def start(self) -> Array:
@@ -179,7 +181,7 @@ class ZoneProblem:
         return moving
 
     def _sigma(self, expected: Array, kernels: tuple[Array, Array] | None) -> Array:
-        variance = self.noise.variance(expected)
+        variance = self.noise.variance(expected) + (self.noise.faint * expected.max(axis=(1, 2), keepdims=True)) ** 2
         if kernels is not None:  # a blurred picture is not fitted to its noise: the brightest pixel's tenth will do
             variance = variance + (0.1 * expected.max(axis=(1, 2), keepdims=True)) ** 2
         return np.asarray(np.sqrt(variance))

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import finufft
 import numpy as np
@@ -31,6 +31,7 @@ from holocal.optics.bench import Array
 
 NUFFT_EPS = 1e-4
 MARGIN_PX = 6  # the field is computed over so much more than the window: what W throws into it comes from there
+LEAST_HELD = 0.5  # of the light beside a zone's direction: less is not made up for
 PER_FRINGE = 1.7  # samples per shortest period of the intensity; the pixel's own integral damps what would alias
 
 Seen = tuple[Array, NDArray[np.complex64]]  # pupil points (n, 2), values (n,): what `analyse` gives for a zone
@@ -40,13 +41,25 @@ Seen = tuple[Array, NDArray[np.complex64]]  # pupil points (n, 2), values (n,): 
 class Window:
     """The pixels of a zone: (2 half + 1) columns and rows, the middle one at (column, row); where they look.
 
-    `direction` (2, 2) takes an offset in pixels (columns to the right, rows *up*) to direction sines in P.
+    `direction` (2, 2) takes an offset in pixels (columns to the right, rows *up*) to direction sines in P. To second
+    order, the pixel at (x, y) from the middle shows what the model has at (x, y) + `curve` (2, 3) @ (x^2, x y, y^2).
+    `envelope` (2,) is the logarithmic slope of the light per pixel that is not the pupil's: the panel's pixels send
+    less light the farther they turn it. `relief_m` (2, 2) is d q / d s, how the pupil point of light from a place of
+    the panel moves with the direction, at q = 0, and `relief_slope` (2, 2, 2) its derivative by q. `magnified` (2, 2)
+    takes q to where the light of a bench out of line crosses the pupil, but for a shift. `block_m` (2, 2) is how far q
+    moves with a block along each axis of the panel: `analyse` has less of the light beside the zone's own direction.
     """
 
     column: int
     row: int
     half: tuple[int, int]
     direction: Array
+    relief_m: Array
+    relief_slope: Array = field(default_factory=lambda: np.zeros((2, 2, 2)))
+    curve: Array = field(default_factory=lambda: np.zeros((2, 3)))
+    envelope: Array = field(default_factory=lambda: np.zeros(2))
+    magnified: Array = field(default_factory=lambda: np.eye(2))
+    block_m: Array = field(default_factory=lambda: np.zeros((2, 2)))
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -62,6 +75,13 @@ class Window:
     def pixel(self) -> float:
         """A pixel's size in direction sines, the root of its area."""
         return float(np.sqrt(abs(np.linalg.det(self.direction))))
+
+    @property
+    def mixed_relief_m(self) -> Array:
+        """The part of `relief_m` that turns light along one axis of the pixels to the other, (2, 2) in P."""
+        metric = self.direction.T @ self.relief_m @ self.direction
+        back = np.linalg.inv(self.direction)
+        return np.asarray(back.T @ (metric - np.diag(np.diag(metric))) @ back)
 
     @property
     def to_pupil(self) -> Array:
@@ -110,7 +130,6 @@ class Pupil:
 
     radius_m: float
     edge_m: float
-    relief_m: float
     wavelength_m: float
 
     @property
@@ -130,10 +149,23 @@ class SpotModel:
         For each frame the pupil points (n, 2) and values (n,) of `analyse`.
     degree
         Of W and a.
+    bends_per_m, bent_about_m
+        For each frame the known defocus: its light turns by -bend (q - bent_about_m). Where the relief differs over
+        the pupil, or has a mixed part, the rim that this light sees lies elsewhere: by 10 um at 4K, some percent of
+        the light.
     """
 
     def __init__(
-        self, window: Window, seen: Sequence[Seen], box: PupilBox, pupil: Pupil, *, degree: int, device: str = "cpu"
+        self,
+        window: Window,
+        seen: Sequence[Seen],
+        box: PupilBox,
+        pupil: Pupil,
+        *,
+        degree: int,
+        bends_per_m: Sequence[float] | None = None,
+        bent_about_m: Array | None = None,
+        device: str = "cpu",
     ) -> None:
         self.window, self.box, self.pupil, self.degree, self.device = window, box, pupil, degree, device
         per_metre = pupil.wavenumber * window.pixel  # radians per pixel
@@ -147,12 +179,18 @@ class SpotModel:
             step = 2 * np.pi / (len(wide[axis]) / self._fine[axis]) / per_metre
             low, high = box.centre_m[axis] - box.half_m[axis], box.centre_m[axis] + box.half_m[axis]
             grid.append(np.arange(np.ceil(low / step), np.floor(high / step) + 1) * step)
-        self.pupil_m = np.stack(np.meshgrid(grid[0], grid[1]), axis=-1) @ box.to_pupil
+        q = np.stack(np.meshgrid(grid[0], grid[1]), axis=-1) @ box.to_pupil
+        bends = np.zeros(len(seen)) if bends_per_m is None else np.asarray(bends_per_m, np.float64)
+        turn = -(q - (np.zeros(2) if bent_about_m is None else bent_about_m))
+        relief = window.mixed_relief_m + np.einsum("ijk,yxk->yxij", window.relief_slope, q)
+        moved = np.einsum("yxij,yxj->yxi", relief, turn)
+        # (frames, rows, columns, 2), as the rim has it
+        self.pupil_m = q @ window.magnified.T + bends[:, None, None, None] * moved
         self.field = self._complex(np.stack([self._in_pupil(one, wide, grid, per_metre) for one in seen]))
         self._out_x = self._complex(np.exp(1j * per_metre * np.outer(grid[0], near[0])))
         self._out_y = self._complex(np.exp(1j * per_metre * np.outer(near[1], grid[1])))
-        # The phase k r ds^2 / 2 along each axis: the pixels' directions are at right angles to a percent or two.
-        metric = window.direction.T @ window.direction * pupil.wavenumber * pupil.relief_m / 2
+        # The phase k ds r ds / 2 along each axis of the picture; its mixed part is the rim's (`pupil_m`).
+        metric = window.direction.T @ window.relief_m @ window.direction * pupil.wavenumber / 2
         ways = [
             np.exp(-1j * per_metre * np.outer(g, w))
             * np.exp(1j * metric[a, a] * w * w)
@@ -164,12 +202,17 @@ class SpotModel:
         in_x, in_y = (legendre.legvander((grid[a] - box.centre_m[a]) / box.half_m[a], degree) for a in (0, 1))
         self._in_x, self._in_y = (self._real(np.asarray(table.T, np.float64)) for table in (in_x, in_y))
         over_x, over_y = (_pixel_means(2 * half + 1, f) for half, f in zip(window.half, self._fine, strict=True))
-        self._over_x, self._over_y = self._real(over_x.T), self._real(over_y[::-1])  # row 0 is on top
+        fall_x, fall_y = (
+            np.exp(slope * np.arange(-half, half + 1.0))[:, None]
+            for slope, half in zip(window.envelope, window.half, strict=True)
+        )
+        self._over_x = self._real((over_x * fall_x).T)
+        self._over_y = self._real((over_y * fall_y)[::-1])  # row 0 is on top
 
     def only(self, frames: Sequence[int]) -> SpotModel:
         """Return the model of some of the frames."""
         chosen = copy.copy(self)
-        chosen.field = self.field[list(frames)]
+        chosen.field, chosen.pupil_m = self.field[list(frames)], self.pupil_m[list(frames)]
         return chosen
 
     @property
@@ -196,6 +239,9 @@ class SpotModel:
             steps[1].astype(np.float32), steps[0].astype(np.float32), source, (counts[1], counts[0]),
             eps=NUFFT_EPS, isign=1, nthreads=1,
         )  # fmt: skip
+        ds = np.stack(np.meshgrid(wide[0], wide[1]), axis=-1) @ self.window.direction.T
+        held = np.sinc(ds @ self.window.block_m * self.pupil.wavenumber / (2 * np.pi)) ** 2
+        there = there / np.prod(np.maximum(held, LEAST_HELD), axis=-1)
         back_x = np.exp(-1j * per_metre * np.outer(wide[0], grid[0])) / counts[0]
         back_y = np.exp(-1j * per_metre * np.outer(grid[1], wide[1])) / counts[1]
         return np.asarray(back_y @ there @ back_x)
@@ -207,13 +253,13 @@ class SpotModel:
         return torch.from_numpy(np.ascontiguousarray(values, np.complex64)).to(self.device)
 
     def transmission(self, shift_m: Array) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the pupil's transmission on the grid, and its derivatives (2, ...) per metre of `shift_m`."""
+        """Return the pupil's transmission on the grid (frames, ...), and its derivatives (frames, 2, ...) per metre."""
         x, y = self._real(self.pupil_m[..., 0] - shift_m[0]), self._real(self.pupil_m[..., 1] - shift_m[1])
         edge_m = max(self.pupil.edge_m, 1e-5)
         r = torch.clamp(torch.hypot(x, y), min=1e-6)
         z = torch.clamp((self.pupil.radius_m - r) / edge_m, -0.5, 0.5)
         slope = torch.where(z.abs() < 0.5, 0.5 * np.pi / edge_m * torch.cos(np.pi * z), 0.0)
-        return 0.5 + 0.5 * torch.sin(np.pi * z), torch.stack([slope * x / r, slope * y / r])
+        return 0.5 + 0.5 * torch.sin(np.pi * z), torch.stack([slope * x / r, slope * y / r], dim=1)
 
     def intensity(self, wavefront_rad: Array, log_amplitude: Array, shift_m: Array) -> torch.Tensor:
         """Return the power on every pixel, (frames, rows, columns), row 0 on top.

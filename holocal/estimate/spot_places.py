@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,8 @@ from holocal.optics.bench import Array
 
 BRIGHT = 0.05  # of the brightest spot's light: a fainter one is not used for the map
 ROUNDS = 4
-OUTLIER_SIGMAS, LEAST_SPREAD_PX = 5.0, 0.5
+OUTLIER_SIGMAS = 5.0
+LEAST_SPREAD_PX, SURE_SPREAD_PX = 0.5, 0.05  # of centroids, of places by fitted wavefronts
 # Terms of the map: a shift from 2 spots, affine from 5, quadratic from 9, cubic from 16.
 TERMS = ((16, 10), (9, 6), (5, 3), (2, 1))
 
@@ -22,14 +23,16 @@ TERMS = ((16, 10), (9, 6), (5, 3), (2, 1))
 class SpotPlaces:
     """The map from expected to seen places, pixels: seen = place + terms(place) @ `coefficients` (terms, 2).
 
-    `seen` (spots, 2) is the centroid of those used, the map's place for the others; `used` says which; `residual_px` is
-    the used ones' rms distance from the map; with fewer than two `used` nothing is known and the map is the identity.
+    `places` (spots, 2) are from the picture's `middle` (2,). `seen` (spots, 2) is the centroid of those used, the map's
+    place for the others; `used` says which; `residual_px` is the used ones' rms distance from the map; with fewer than
+    two `used` nothing is known and the map is the identity.
     """
 
     places: Array
     seen: Array
     used: NDArray[np.bool_]
     coefficients: Array
+    middle: Array
     scale_px: float
     residual_px: float
 
@@ -41,6 +44,15 @@ class SpotPlaces:
         """Return d seen / d place, (n, 2, 2)."""
         steps = [self.at(places + e) - self.at(places - e) for e in np.eye(2)]
         return np.stack(steps, axis=-1) / 2
+
+    def moved(self, seen: Array, used: NDArray[np.bool_]) -> SpotPlaces:
+        """Return the map from better places (spots, 2) of those that are `used`; outliers are left out."""
+        middle = self.middle
+        coefficients, kept = _robust(self.places / self.scale_px, seen - middle - self.places, used, SURE_SPREAD_PX)
+        fitted = self.places + _terms(self.places / self.scale_px)[:, : len(coefficients)] @ coefficients + middle
+        off = float(np.sqrt(np.mean(np.sum((seen - fitted)[kept] ** 2, axis=1)))) if kept.any() else float("nan")
+        where = np.where(used[:, None], seen, fitted)
+        return replace(self, seen=where, used=kept, coefficients=coefficients, residual_px=off)
 
 
 def find_spots(picture: Array, places: Array, light: Array, sigma_px: float) -> SpotPlaces:
@@ -78,11 +90,15 @@ def find_spots(picture: Array, places: Array, light: Array, sigma_px: float) -> 
         if used.any():
             residual = float(np.sqrt(np.mean(np.sum((seen - predicted)[used] ** 2, axis=1))))
     if np.count_nonzero(used) < 2:
-        return SpotPlaces(centred, places, np.zeros(len(places), np.bool_), np.zeros((1, 2)), scale, float("nan"))
-    return SpotPlaces(centred, np.where(used[:, None], seen, predicted), used, coefficients, scale, residual)
+        return SpotPlaces(
+            centred, places, np.zeros(len(places), np.bool_), np.zeros((1, 2)), middle, scale, float("nan")
+        )
+    return SpotPlaces(centred, np.where(used[:, None], seen, predicted), used, coefficients, middle, scale, residual)
 
 
-def _robust(at: Array, moved: Array, used: NDArray[np.bool_]) -> tuple[Array, NDArray[np.bool_]]:
+def _robust(
+    at: Array, moved: Array, used: NDArray[np.bool_], least_px: float = LEAST_SPREAD_PX
+) -> tuple[Array, NDArray[np.bool_]]:
     """Return the fit after leaving out, worst first, what lies far off it."""
     coefficients: Array = np.zeros((1, 2))
     while np.count_nonzero(used) >= 2:
@@ -91,7 +107,7 @@ def _robust(at: Array, moved: Array, used: NDArray[np.bool_]) -> tuple[Array, ND
         count = min(count, 3) if np.count_nonzero(used) > 5 and coefficients.shape[0] == 1 else count
         coefficients = np.asarray(np.linalg.lstsq(_terms(at[used])[:, :count], moved[used], rcond=None)[0], np.float64)
         off = np.linalg.norm(moved - _terms(at)[:, :count] @ coefficients, axis=1)
-        spread = max(1.4826 * float(np.median(off[used])), LEAST_SPREAD_PX)
+        spread = max(1.4826 * float(np.median(off[used])), least_px)
         worst = int(np.argmax(np.where(used, off, 0.0)))
         if off[worst] > OUTLIER_SIGMAS * spread:
             used = used.copy()

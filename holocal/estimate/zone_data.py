@@ -12,11 +12,15 @@ from holocal.optics.bench import Array
 
 @dataclass(frozen=True)
 class Noise:
-    """The variance law of counts: `read_variance` + `gain` s + `flicker_squared` s^2, s the signal in counts."""
+    """The variance law of counts: `read_variance` + `gain` s + `flicker_squared` s^2, s the signal in counts.
+
+    `faint` is what the model of a picture leaves in its dark parts, as a share of the brightest pixel.
+    """
 
     read_variance: float
     gain: float
     flicker_squared: float = 0.0
+    faint: float = 0.0
 
     def variance(self, signal: Array) -> Array:
         """Return the variance of counts whose expected signal is this."""

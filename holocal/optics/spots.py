@@ -152,29 +152,80 @@ def synthesise(
 
 
 def analyse(
-    waves: SpotWaves, field: torch.Tensor, *, reach_m: float, block: int = BLOCK
+    waves: SpotWaves, field: torch.Tensor, *, reach_m: float, block: int = BLOCK, sent: SpotWaves | None = None
 ) -> list[tuple[Array, NDArray[np.complex64]]]:
-    """Return for each point the pupil points q (n, 2) of the blocks within reach, and sum u exp(-i phi_p) over each.
+    """Return for each point pupil points q (n, 2) of the blocks' corners within reach, and sum w u exp(-i phi_p) there.
 
-    The adjoint of `synthesise` with a window of 1: (blocks,) complex64 each. `field` is (height, width) complex64.
+    w falls from a corner to 0 over a block each way: the sums of all corners are that of all pixels, so that this is
+    the adjoint of `synthesise` with a window of 1. Blocks without such weights would take light from a quarter of a
+    diffraction order away (for 4 pixels) for the point's own. Light from directions ds beside the point's adds up to
+    less by sinc^2 of k ds . dq / 2 pi a way, dq being a block's step in the pupil.
+
+    `field` is (height, width) complex64, the values are complex64. With `sent` each corner counts as the area of its
+    pixels sends these waves: times the sinc of the frequency that they leave with, less that of the illumination.
     """
     height, width = field.shape
     columns, rows = -(-width // block), -(-height // block)
     if (rows * block, columns * block) != (height, width):
         field = torch.nn.functional.pad(field, (0, columns * block - width, 0, rows * block - height))
     blocks = field.reshape(rows, block, columns, block)
-    found: list[tuple[list[Array], list[NDArray[np.complex64]]]] = [([], []) for _ in range(waves.count)]
+    sums: dict[int, torch.Tensor] = {}
+    lit: dict[int, tuple[slice, slice]] = {}
     for point, part in _parts(waves, reach_m, block):
-        along_x, along_y = part.carriers(str(field.device))
-        held = torch.sum(blocks[part.rows, :, part.columns] * along_y.conj()[..., None], dim=1)
-        values = torch.sum(held * along_x.conj(), dim=-1).cpu().numpy() * part.centre().conj()
-        pupil = part.pupil()
+        if point not in sums:
+            sums[point] = torch.zeros((rows + 1, columns + 1), dtype=torch.complex64, device=field.device)
+        corners = _to_corners(blocks, part)
+        for down, right in ((0, 0), (0, 1), (1, 0), (1, 1)):
+            where = (_moved(part.rows, down), _moved(part.columns, right))
+            sums[point][where] += corners[down][right]
+        before = lit.get(point, (part.rows, part.columns))
+        lit[point] = (_around(before[0], part.rows), _around(before[1], part.columns))
+    found: list[tuple[Array, NDArray[np.complex64]]] = []
+    x, y = waves.block_grid(block)
+    half = block / 2 * waves.panel.pitch_m
+    x, y = np.append(x - half, x[-1] + half), np.append(y + half, y[-1] - half)
+    for point in range(waves.count):
+        if point not in sums:
+            found.append((np.zeros((0, 2)), np.zeros(0, np.complex64)))
+            continue
+        height_lit, width_lit = (slice(one.start, one.stop + 1) for one in lit[point])
+        part = _Part(waves, point, height_lit, width_lit, x[width_lit], y[height_lit], block)
+        pupil, values = part.pupil(), sums[point][height_lit, width_lit].cpu().numpy()
+        if sent is not None:
+            values = values * replace(part, waves=sent).areas()
         near = np.hypot(pupil[..., 0], pupil[..., 1]) <= reach_m
-        found[point][0].append(pupil[near])
-        found[point][1].append(values[near])
-    return [
-        (np.concatenate(q), np.concatenate(v)) if q else (np.zeros((0, 2)), np.zeros(0, np.complex64)) for q, v in found
-    ]
+        found.append((pupil[near], values[near]))
+    return found
+
+
+def _to_corners(blocks: torch.Tensor, part: _Part) -> list[list[torch.Tensor]]:
+    """Return what the blocks of a part add to their corners, [top, bottom][left, right] of (rows, columns) each."""
+    block = part.block
+    along_x, along_y = (one.conj() for one in part.carriers(str(blocks.device)))
+    centre = torch.from_numpy(part.centre()).to(blocks.device).conj()
+    share = [(j + 0.5) / block for j in range(block)]  # of a pixel, that goes to the farther corner
+    whole = bottom = None
+    for j in range(block):
+        line = blocks[part.rows, j, part.columns] * along_y[:, j, :, None]
+        whole = line if whole is None else whole + line
+        bottom = share[j] * line if bottom is None else bottom + share[j] * line
+    assert whole is not None
+    assert bottom is not None
+    out = []
+    for held in (whole - bottom, bottom):
+        turned = held * along_x
+        total = torch.sum(turned, dim=-1) * centre
+        right = torch.sum(turned * torch.tensor(share, device=blocks.device), dim=-1) * centre
+        out.append([total - right, right])
+    return out
+
+
+def _moved(part: slice, by: int) -> slice:
+    return slice(part.start + by, part.stop + by)
+
+
+def _around(one: slice, other: slice) -> slice:
+    return slice(min(one.start, other.start), max(one.stop, other.stop))
 
 
 @dataclass(frozen=True)
@@ -197,6 +248,15 @@ class _Part:
         """Return exp(i phi) at the blocks' centres."""
         turns = self._of(self.waves.turns).on_grid(self.x_m, self.y_m)
         return _phasor(2 * np.pi * (turns - np.round(turns))).numpy()
+
+    def areas(self) -> NDArray[np.float32]:
+        """Return what a pixel's area sends of the wave, (rows, columns), 1 for light that is not turned."""
+        series, panel = self._of(self.waves.turns), self.waves.panel
+        made = np.ones((1, 1))
+        for axis, own in zip((1, 0), panel.illumination_frequency_per_m, strict=True):
+            turned = derivative(series, axis).on_grid(self.x_m, self.y_m) - own
+            made = made * np.sinc(turned * panel.pitch_m)
+        return np.asarray(made, np.float32)
 
     def carriers(self, device: str) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the plane wave's factors along x (rows, columns, block) and along y (rows, block, columns)."""

@@ -71,13 +71,28 @@ def test_a_spot_is_held_by_its_own_wave_and_hardly_by_another():
     assert held[0] > 20 * max(held[1:])
 
 
+def test_light_from_a_quarter_of_an_order_away_is_not_taken_for_the_points_own():
+    panel = PANELS["whole blocks"]
+    waves = waves_of(panel)
+    alone = synthesise(waves, np.array([1.0, 0, 0, 0]), lambda q: np.ones(q.shape[:-1]), reach_m=2.0e-3)
+
+    def light_inside(field):  # at the panel's edges a corner has half its weights
+        pupil, values = analyse(waves, field, reach_m=1.5e-3)[0]
+        off = np.abs(pupil - pupil.mean(axis=0))
+        return np.sum(np.abs(values[np.all(off < 0.8 * off.max(axis=0), axis=1)]) ** 2)
+
+    for turns in (0.25 - 0.01, 0.25 + 0.01):  # per pixel: blocks of 4 see it as 0.01 turns per pixel
+        ramp = torch.polar(torch.ones(panel.width), 2 * np.pi * turns * torch.arange(panel.width))
+        assert light_inside(alone * ramp) < 1e-5 * light_inside(alone)  # evenly weighted blocks: 1.5e-3
+
+
 def test_blocks_beyond_reach_are_left_out_and_their_pupil_points_are_exact():
     panel = PANELS["whole blocks"]
     waves = waves_of(panel)
     pupil, values = analyse(waves, torch.ones((panel.height, panel.width), dtype=torch.complex64), reach_m=0.4e-3)[0]
     assert len(pupil) == len(values) > 100
     assert np.linalg.norm(pupil, axis=1).max() <= 0.4e-3
-    x, y = waves.block_grid()
+    x, y = (line - 2 * panel.pitch_m * sign for line, sign in zip(waves.block_grid(), (1, -1), strict=True))
     slm = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     exact = exact_phase(BENCH, VirtualPoints.at(TANGENTS[0]), slm, wavelength_m=WAVELENGTH_M).pupil_m
     distance = np.linalg.norm(exact[:, None] - pupil[None, :20], axis=-1).min(axis=0)
