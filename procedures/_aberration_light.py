@@ -29,7 +29,7 @@ from procedures._aberration_spots import (
 )
 
 if TYPE_CHECKING:
-    from procedures.aberration import State
+    from procedures._aberration_model import State
 
 Array = NDArray[np.float64]
 
@@ -117,7 +117,7 @@ def told(state: State, reference: Reference) -> State:
     The phase of a sum of waves gives each another share of the light than its amplitude squared: the first guess at
     equal brightness is corrected once, on the levels themselves.
     """
-    from procedures.aberration import FIRST_PEAK, PEAK_OVER_MEAN
+    from procedures._aberration_model import FIRST_PEAK, PEAK_OVER_MEAN
 
     camera, array = state.facts.camera, array_of(state)
     state = replace(state, reference=reference)
@@ -171,7 +171,7 @@ def places_in(state: State, frame: int) -> SpotPlaces:
 
 def with_first(state: State, frame: Frame) -> State:
     """Return the state with the first frame and the exposure it leads to, or with the next guess."""
-    from procedures.aberration import CLIPPED, FAINT, SEARCHES, WANTED_PEAK, taken
+    from procedures._aberration_model import CLIPPED, FAINT, SEARCHES, WANTED_PEAK, taken
 
     camera, array = state.facts.camera, array_of(state)
     if not array.on.any():

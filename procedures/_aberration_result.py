@@ -31,7 +31,7 @@ from procedures._aberration_truth import residuals_rad
 from procedures._aberration_zones import CameraNoise, Estimate, Shown, estimate
 
 if TYPE_CHECKING:
-    from procedures.aberration import State
+    from procedures._aberration_model import State
 
 Array = NDArray[np.float64]
 Extent = tuple[float, float, float, float]
@@ -139,7 +139,8 @@ def conclusion(state: State, fresh: State) -> Conclusion:
     if failed:
         sentence += f"; {len(failed)} of {lit} lit zones are not believed and take the others' prediction"
     extent = extent_of(state)
-    maps, units = maps_of(state, found)
+    maps, units = maps_of(state, found.valid)
+    mosaics = mosaic_of(state, found), mosaic_of(fresh, check)
     return Conclusion(
         before=before,
         after=after,
@@ -150,8 +151,8 @@ def conclusion(state: State, fresh: State) -> Conclusion:
         targets_met=bool(met),
         sentence=sentence,
         maps=maps,
-        before_map=mosaic_of(state, found),
-        after_map=mosaic_of(fresh, check),
+        before_map=mosaics[0],
+        after_map=mosaics[1],
         map_units=units | {"before": "counts", "after": "counts"},
         map_metadata={"wavelength_nm": chosen.wavelength_nm},
         extent_deg=extent,
@@ -171,9 +172,9 @@ def conclusion(state: State, fresh: State) -> Conclusion:
             "exposures_s": [*state.exposures_s.tolist(), *fresh.exposures_s.tolist()],
             "zones_lit": lit,
             "zones_believed": believed,
-            "rig_facts": _geometry(state),
+            "rig_facts": geometry_of(state),
         },
-        figures=figures_of(state, fresh, found, check, before, after, extent),
+        figures=figures_of(chosen, mosaics, found.valid, before, after, extent),
     )
 
 
@@ -191,7 +192,8 @@ def retest(array: SpotArray, one: Estimate, other: Estimate) -> float:
     return float(np.sqrt(max(1.0, float(np.mean(off))))) if off else 1.0
 
 
-def _geometry(state: State) -> dict[str, float]:
+def geometry_of(state: State) -> dict[str, float]:
+    """Return what `residual_of` must know of panel and pupil."""
     facts = state.facts
     return {
         "panel_width": facts.slm.width,
@@ -225,8 +227,14 @@ def _side(
                 "chi2": None if fit is None else fit.chi2,
             }
         )
-    rms = [shown_rms(array, int(zone), means[zone], found.pupil_m) for zone in np.flatnonzero(found.valid)]
-    sharpest = [float(sharp[zone]) for zone in np.flatnonzero(found.valid & np.isfinite(sharp))]
+    return summarised(zones)
+
+
+def summarised(zones: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return `before` or `after`: the zones, and the median and the worst of those that are valid."""
+    valid = [zone for zone in zones if zone["valid"]]
+    rms = [zone["wavefront_rms_rad"] for zone in valid]
+    sharpest = [zone["sharpness"] for zone in valid if zone["sharpness"] is not None]
     nothing = {"wavefront_rms_rad": UNKNOWN_RAD, "sharpness": 0.0}
     return {
         "median": {
@@ -302,34 +310,46 @@ def _left_out(array: SpotArray, found: Estimate) -> dict[str, Any]:
 
 def residual_of(done: Conclusion, truth: Mapping[str, Any]) -> dict[str, Any]:
     """Return what the correction leaves of a simulated bench's exact phase, in every zone that is lit."""
+    model = done.extra["field"]
+    tangents = tangents_of(done)
+    values = field_terms(tangents, (model["half_tan"][0], model["half_tan"][1])) @ np.array(model["coefficients_rad"]).T
+    return {
+        "residual_rms_rad": left_of(done, truth, values),
+        "before_rms_rad": left_of(done, truth, np.zeros_like(values)),
+    }
+
+
+def tangents_of(done: Conclusion) -> Array:
+    """Return the zones' directions, (zones, 2)."""
+    return np.asarray(np.tan(np.radians([zone["field_deg"] for zone in done.before["zones"]])))
+
+
+def left_of(done: Conclusion, truth: Mapping[str, Any], values: Array) -> dict[str, Any]:
+    """Return what an aberration of (zones, modes) radians, taken off, leaves of a simulated bench's exact phase.
+
+    Rms over every zone's light, and the median and the worst of the zones that are valid.
+    """
     extra = done.extra
     facts, noll = extra["rig_facts"], extra["noll"]
-    wavelength_m = float(extra["wavelength_nm"]) * 1e-9
     panel = Panel(int(facts["panel_width"]), int(facts["panel_height"]), facts["pitch_m"])
     diameter = (truth.get("camera") or {}).get("pupil_mm")
     nominal = Bench.nominal(
         pupil_diameter_m=facts["pupil_diameter_m"] if diameter is None else 1e-3 * diameter,
         eye_relief_m=facts["eye_relief_m"],
     )
-    tangents = np.tan(np.radians([zone["field_deg"] for zone in done.before["zones"]]))
-    model = extra["field"]
-    values = field_terms(tangents, (model["half_tan"][0], model["half_tan"][1])) @ np.array(model["coefficients_rad"]).T
     # Noll terms are those of the nominal pupil, whatever the camera's own stop.
     scaled = values if diameter is None else _rescaled(values, noll, facts["pupil_diameter_m"] / (1e-3 * diameter))
+    left = residuals_rad(
+        nominal, panel, truth, tangents_of(done), wavelength_m=float(extra["wavelength_nm"]) * 1e-9, noll=noll,
+        coefficients_rad=scaled,
+    )  # fmt: skip
     valid = np.array([zone["valid"] for zone in done.before["zones"]])
-    out: dict[str, Any] = {}
-    for name, given in (("residual", scaled), ("before", np.zeros_like(scaled))):
-        left = residuals_rad(
-            nominal, panel, truth, tangents, wavelength_m=wavelength_m, noll=noll, coefficients_rad=given
-        )
-        counted = left[valid & np.isfinite(left)]
-        key = "residual_rms_rad" if name == "residual" else "before_rms_rad"
-        out[key] = {
-            "median": float(np.median(counted)) if len(counted) else None,
-            "worst": float(np.max(counted)) if len(counted) else None,
-            "zones": [float(value) if np.isfinite(value) else None for value in left],
-        }
-    return out
+    counted = left[valid & np.isfinite(left)]
+    return {
+        "median": float(np.median(counted)) if len(counted) else None,
+        "worst": float(np.max(counted)) if len(counted) else None,
+        "zones": [float(value) if np.isfinite(value) else None for value in left],
+    }
 
 
 def _rescaled(values: Array, noll: list[int], ratio: float) -> Array:

@@ -77,7 +77,9 @@ class Plan:
 class Figure:
     """A picture for the report: its data, not its drawing.
 
-    `kind` is "map", "image", "curve", "pair", "histogram" or "corner". A corner shows the "samples" (k, d) of a
+    `kind` is "map", "image", "curve", "pair", "histogram", "sheet" or "corner". A sheet is a contact sheet: "sheet"
+    (rows x cell, columns x cell) from 0 to 1, "rows" (rows,) the values that its rows were taken with, `labels` its
+    columns, and "best" (columns,) the value to mark in each, NaN for none. A corner shows the "samples" (k, d) of a
     posterior, at most the first 12 parameters, with the names `labels`; its arrays "truth" (d,), "laplace_mean" (d,)
     and "laplace_covariance" (d, d) are drawn over them where they are given.
     """
@@ -90,7 +92,7 @@ class Figure:
     caption: str = ""
     extent_deg: tuple[float, float, float, float] | None = None  # left, right, bottom, top
     target: float | None = None
-    labels: tuple[str, ...] = ()  # of a corner's parameters
+    labels: tuple[str, ...] = ()  # of a corner's parameters, a sheet's columns
 
 
 @dataclass(frozen=True)

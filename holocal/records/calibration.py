@@ -127,8 +127,8 @@ def accept(run: Path, identity: Mapping[str, Any]) -> dict[str, Any]:
     Raises
     ------
     RefusedError
-        The run is not complete, missed its targets, is of another rig, or was measured under other corrections than
-        those that are in force now.
+        The run is not complete, missed its targets, corrects nothing, is of another rig, or was measured under other
+        corrections than those that are in force now.
     InputError
         The run's files are not what its manifest says.
     """
@@ -143,6 +143,13 @@ def accept(run: Path, identity: Mapping[str, Any]) -> dict[str, Any]:
             measured=result.get("after"),
             limit=result.get("targets"),
             code="targets-missed",
+        )
+    if result.get("correction") == "none":
+        raise RefusedError(
+            f"{run.name} corrects nothing: {result.get('sentence', 'see its report')}",
+            why="It only shows the bench as it is.",
+            fix=f"Measure a correction: `holocal run {procedure} --rig {result.get('rig')}`.",
+            code="no-correction",
         )
     check_identity(
         read_json(run / "identity.json"),

@@ -278,3 +278,18 @@ def test_a_full_disk_ends_the_run_with_its_reason_and_nothing_half_written(holoc
     (directory,) = (workplace / "runs").iterdir()
     assert not list(directory.rglob("*checkpoint*"))
     assert not list(directory.rglob("*.tmp*"))
+
+
+def test_a_mode_is_the_same_as_setting_it_and_refused_where_a_procedure_has_none(holocal):
+    plans = [
+        holocal("run", "aberration", "--rig", "simulated-small", "--dry-run", "--json", *how).json
+        for how in (["--mode", "sweep"], ["--set", "mode=sweep"], [])
+    ]
+    assert plans[0] == plans[1]
+    assert plans[0]["frames"] == 12
+    assert plans[2]["frames"] == 6
+    answer = holocal(*RUN, "--mode", "sweep")
+    assert answer.status == 2
+    assert "mode" in answer.json["error"]["what"]
+    wrong = holocal("run", "aberration", "--rig", "simulated-small", "--mode", "guess", "--json")
+    assert wrong.status == 2

@@ -13,7 +13,7 @@ def report_run(done: RunResult, *, as_json: bool) -> int:
     terminal.say(f"{'done' if met else 'target not met'}  {done.sentence}", "bold green" if met else "bold yellow")
     frames, seconds = done.result["frames"], done.result["seconds"]
     terminal.say(f"      {frames} frames, {seconds:.1f} s   report  {done.directory / 'report.html'}")
-    if met:
+    if met and done.result.get("correction") != "none":
         terminal.say(f"next  holocal accept {done.directory}")
     if as_json:
         emit_json(done.result)

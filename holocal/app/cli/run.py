@@ -22,6 +22,10 @@ def run(
     keep_frames: Annotated[
         bool, typer.Option("--keep-frames", help="Keep every frame: the run can be replayed without the bench.")
     ] = False,
+    mode: Annotated[
+        str | None,
+        typer.Option("--mode", metavar="NAME", help="Which of a procedure's ways; as --set mode=NAME."),
+    ] = None,
     yes: options.Yes = False,
     debug: options.Debug = False,
 ) -> None:
@@ -32,7 +36,8 @@ def run(
     from holocal.app.terminal import Terminal, emit_json
     from holocal.records.rig import load_rig
 
-    for_rig, for_procedure = split_overrides(set_ or [], procedure)
+    chosen = [*(set_ or []), *([] if mode is None else [f"{procedure}.mode={mode}"])]
+    for_rig, for_procedure = split_overrides(chosen, procedure)
     config = load_rig(rig, for_rig, device=options.checked_device(device))
     with Terminal() as terminal:
         if dry_run:

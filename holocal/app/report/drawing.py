@@ -49,6 +49,10 @@ def draw(figure: Figure) -> str:
                 from holocal.app.report.corner import draw_corner  # it takes its colours from here
 
                 canvas = draw_corner(figure)
+            case "sheet":
+                from holocal.app.report.sheet import draw_sheet
+
+                canvas = draw_sheet(figure)
             case _:
                 canvas = _map(figure)
         return data_uri(canvas)
