@@ -206,7 +206,7 @@ class ModelMode:
 
     def against_truth(self, conclusion: Conclusion, truth: Mapping[str, Any]) -> dict[str, Any]:
         """Return what the correction leaves of the simulated bench's exact phase."""
-        from procedures._aberration_result import residual_of
+        from procedures._aberration_truth import residual_of
 
         return residual_of(conclusion, truth)
 

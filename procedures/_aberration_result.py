@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from hashlib import sha256
 from typing import TYPE_CHECKING, Any
@@ -10,11 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from holocal.estimate.field_model import DEGREE, field_terms
+from holocal.estimate.field_model import DEGREE
+from holocal.estimate.spot_fit import ZoneProblem
 from holocal.estimate.zone_data import Noise
 from holocal.loop.procedure import Conclusion
-from holocal.optics.bench import Bench, Panel
 from holocal.optics.zernike import zernike
+from holocal.threads import each
 from procedures._aberration_directions import lit_grid
 from procedures._aberration_light import (
     array_of,
@@ -27,7 +27,6 @@ from procedures._aberration_light import (
 )
 from procedures._aberration_pictures import extent_of, figures_of, maps_of, mosaic_of
 from procedures._aberration_spots import SpotArray
-from procedures._aberration_truth import residuals_rad
 from procedures._aberration_zones import CameraNoise, Estimate, Shown, estimate
 
 if TYPE_CHECKING:
@@ -39,6 +38,7 @@ Extent = tuple[float, float, float, float]
 # What the model of a picture leaves beside noise (docs/physics.md 10): of a pixel, and of the brightest pixel.
 MODEL_ERROR, FAINT_ERROR = 0.01, 0.001
 UNKNOWN_RAD = 99.0
+PLACES_PX = (-1 / 3, 0.0, 1 / 3)  # of a spot in a pixel, each way
 _LAST: dict[str, Estimate] = {}
 
 
@@ -253,31 +253,47 @@ def summarised(zones: list[dict[str, Any]]) -> dict[str, Any]:
 def sharpness(state: State, found: Estimate, defocus: float) -> Array:
     """Return how concentrated every zone's spot in focus is, (zones,): 1 is what the frame would give unaberrated.
 
-    The sum of squares over the square of the sum of a window's pixels, noise taken out, over that of the model's
-    picture with no wavefront at all; NaN where there is no such frame or zone.
+    The sum of squares over the square of the sum of a window's pixels, noise taken out. How much of a spot of half a
+    pixel a pixel holds depends on where in it the spot lies: the picture is compared to the model's at its own place,
+    and that, over all places in a pixel, to the model's without a wavefront. NaN where there is no such frame or zone.
     """
     out = np.full(len(found.fits), np.nan)
     frames = np.flatnonzero(state.defocus == defocus)
     if not len(frames):
         return out
     frame = int(frames[0])
-    for zone, (fit, problem, model) in enumerate(zip(found.fits, found.problems, found.models, strict=True)):
-        if fit is None or problem is None or model is None:
-            continue
+
+    def of_zone(zone: int) -> float:
+        fit, problem, box = found.fits[zone], found.problems[zone], found.boxes[zone]
+        if fit is None or problem is None or box is None:
+            return float("nan")
         data, good = problem.data.counts[frame], problem.data.good[frame]
-        perfect = fit.vector.copy()
+        model = problem.expected(fit.vector)[frame]
+        measured = _concentration(data, problem.noise.variance(model), good)
+        at_place = _concentration(model, np.zeros_like(model), good)
+        alone = problem.of_frames((frame,))
+        own = alone.begun_at(fit.vector, fit.layout)
+        perfect = own.copy()
+        # the levels hold the correction: the bench's own wavefront is what undoes it
         correction = state.corrections_rad[frame, zone]
-        perfect[fit.layout.wavefront] = 0.0
-        if correction.any():  # the levels hold the correction: the bench's own wavefront is what undoes it
-            box, noll = found.boxes[zone], state.parameters.noll
-            assert box is not None
-            perfect[fit.layout.wavefront] = _terms_of(box, found.degree, -correction, noll, state)
-        ideal = problem.expected(perfect)[frame]
-        noise = problem.noise.variance(problem.expected(fit.vector)[frame])
-        measured = _concentration(data, noise, good)
-        best = _concentration(ideal, np.zeros_like(noise), good)
-        out[zone] = measured / best if best > 0 else np.nan
-    return out
+        perfect[fit.layout.wavefront] = _terms_of(box, found.degree, -correction, state.parameters.noll, state)
+        typical, best = _over_places(alone, own), _over_places(alone, perfect)
+        return measured / at_place * typical / best if at_place > 0 and best > 0 else float("nan")
+
+    return np.array(each(of_zone, len(out)))
+
+
+def _over_places(problem: ZoneProblem, vector: Array) -> float:
+    """Return a spot's concentration, its mean over where in a pixel it lies."""
+    model, found = problem.model, []
+    per_pixel = model.pupil.wavenumber * model.window.pixel * np.asarray(model.box.half_m)
+    for x in PLACES_PX:
+        for y in PLACES_PX:
+            tilted = vector.copy()
+            tilted[:2] += per_pixel * (x, y)
+            expected = problem.expected(tilted)[0]
+            found.append(_concentration(expected, np.zeros_like(expected), np.ones_like(expected, np.bool_)))
+    return float(np.mean(found))
 
 
 def _terms_of(box: Any, degree: int, coefficients: Array, noll: tuple[int, ...], state: State) -> Array:
@@ -306,58 +322,3 @@ def _left_out(array: SpotArray, found: Estimate) -> dict[str, Any]:
         "worst_rad": float(np.max(off)),
         "sigma_median_rad": float(np.median(sigma)),
     }
-
-
-def residual_of(done: Conclusion, truth: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what the correction leaves of a simulated bench's exact phase, in every zone that is lit."""
-    model = done.extra["field"]
-    tangents = tangents_of(done)
-    values = field_terms(tangents, (model["half_tan"][0], model["half_tan"][1])) @ np.array(model["coefficients_rad"]).T
-    return {
-        "residual_rms_rad": left_of(done, truth, values),
-        "before_rms_rad": left_of(done, truth, np.zeros_like(values)),
-    }
-
-
-def tangents_of(done: Conclusion) -> Array:
-    """Return the zones' directions, (zones, 2)."""
-    return np.asarray(np.tan(np.radians([zone["field_deg"] for zone in done.before["zones"]])))
-
-
-def left_of(done: Conclusion, truth: Mapping[str, Any], values: Array) -> dict[str, Any]:
-    """Return what an aberration of (zones, modes) radians, taken off, leaves of a simulated bench's exact phase.
-
-    Rms over every zone's light, and the median and the worst of the zones that are valid.
-    """
-    extra = done.extra
-    facts, noll = extra["rig_facts"], extra["noll"]
-    panel = Panel(int(facts["panel_width"]), int(facts["panel_height"]), facts["pitch_m"])
-    diameter = (truth.get("camera") or {}).get("pupil_mm")
-    nominal = Bench.nominal(
-        pupil_diameter_m=facts["pupil_diameter_m"] if diameter is None else 1e-3 * diameter,
-        eye_relief_m=facts["eye_relief_m"],
-    )
-    # Noll terms are those of the nominal pupil, whatever the camera's own stop.
-    scaled = values if diameter is None else _rescaled(values, noll, facts["pupil_diameter_m"] / (1e-3 * diameter))
-    left = residuals_rad(
-        nominal, panel, truth, tangents_of(done), wavelength_m=float(extra["wavelength_nm"]) * 1e-9, noll=noll,
-        coefficients_rad=scaled,
-    )  # fmt: skip
-    valid = np.array([zone["valid"] for zone in done.before["zones"]])
-    counted = left[valid & np.isfinite(left)]
-    return {
-        "median": float(np.median(counted)) if len(counted) else None,
-        "worst": float(np.max(counted)) if len(counted) else None,
-        "zones": [float(value) if np.isfinite(value) else None for value in left],
-    }
-
-
-def _rescaled(values: Array, noll: list[int], ratio: float) -> Array:
-    """Return coefficients over a disc `1 / ratio` times as wide that are the same wavefront."""
-    rng = np.random.default_rng(0)
-    angle, radius = rng.uniform(0, 2 * np.pi, 400), np.sqrt(rng.uniform(0, 1, 400))
-    x, y = radius * np.cos(angle), radius * np.sin(angle)
-    highest = list(range(1, max(noll) + 1))
-    wanted = zernike(noll, x / ratio, y / ratio).T @ values.T
-    found = np.linalg.lstsq(zernike(highest, x, y).T, wanted, rcond=None)[0]
-    return np.asarray(found[[highest.index(j) for j in noll]].T)

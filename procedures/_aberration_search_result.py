@@ -16,8 +16,9 @@ from holocal.loop.devices import Frame
 from holocal.loop.procedure import Conclusion
 from procedures._aberration_light import array_of, correction_of, dark_level, half_tan_of
 from procedures._aberration_pictures import extent_of, figures_of, maps_of, mosaic
-from procedures._aberration_result import geometry_of, left_of, residual_of, shown_rms, shown_sigma, summarised
+from procedures._aberration_result import geometry_of, shown_rms, shown_sigma, summarised
 from procedures._aberration_seen import ZoneWindows
+from procedures._aberration_truth import left_of, residual_of
 from procedures._aberration_windows import cut, cut_picture, lit_pupils, noise_of, places_listed, sharpness
 
 if TYPE_CHECKING:
@@ -310,4 +311,4 @@ def _parts(state: State) -> tuple[SearchPlan, SearchState, ZoneWindows]:
 def own_residual_of(done: Conclusion, truth: Mapping[str, Any]) -> dict[str, Any]:
     """Return what the field's correction leaves of the exact phase, and what each zone's own coefficients would."""
     own = np.array([list(zone["coefficients_rad"].values()) for zone in done.before["zones"]])
-    return {**residual_of(done, truth), "zones_own_residual_rms_rad": left_of(done, truth, own)}
+    return {**residual_of(done, truth), "zones_own_residual_rms_rad": left_of(done, truth, own[None])[0]}

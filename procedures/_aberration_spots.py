@@ -261,9 +261,9 @@ def recipe_levels(array: SpotArray, recipe: Recipe, response_rad: Array, device:
 def light_of(array: SpotArray, levels: Levels, response_rad: Array, device: str = "cpu") -> torch.Tensor:
     """Return the field that levels send from the panel, (height, width) complex64, beam and pixels' shape apart."""
     carrier = 2 * np.pi * np.mod(array.panel.illumination_frequency_per_m[1] * array.panel.y_m, 1.0)
-    of_level = torch.from_numpy(np.exp(1j * np.asarray(response_rad)).astype(np.complex64)).to(device)
-    field = of_level[torch.from_numpy(levels.astype(np.int64)).to(device)]
-    return field * torch.from_numpy(np.exp(1j * carrier).astype(np.complex64)).to(device)[:, None]
+    of_level = np.exp(1j * np.asarray(response_rad)).astype(np.complex64)
+    turned = torch.from_numpy(np.exp(1j * carrier).astype(np.complex64)).to(device)
+    return torch.from_numpy(of_level[levels]).to(device).mul_(turned[:, None])
 
 
 def seen_of(

@@ -9,9 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from holocal.estimate.field_model import field_terms
+from holocal.loop.procedure import Conclusion
 from holocal.optics.bench import Bench, Panel, Pose
 from holocal.optics.phase_function import VirtualPoints, exact_phase
 from holocal.optics.zernike import noll_to_nm, zernike
+from holocal.threads import each
 from procedures._aberration_spots import EDGE_M, soft_disc
 
 Array = NDArray[np.float64]
@@ -32,6 +35,62 @@ def true_bench(nominal: Bench, truth: Mapping[str, Any]) -> Bench:
     return replace(nominal, mirror=pose("mirror"), slm=pose("slm"))
 
 
+def residual_of(done: Conclusion, truth: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what the correction leaves of a simulated bench's exact phase, in every zone that is lit."""
+    model = done.extra["field"]
+    tangents = tangents_of(done)
+    values = field_terms(tangents, (model["half_tan"][0], model["half_tan"][1])) @ np.array(model["coefficients_rad"]).T
+    after, before = left_of(done, truth, np.stack([values, np.zeros_like(values)]))
+    return {"residual_rms_rad": after, "before_rms_rad": before}
+
+
+def tangents_of(done: Conclusion) -> Array:
+    """Return the zones' directions, (zones, 2)."""
+    return np.asarray(np.tan(np.radians([zone["field_deg"] for zone in done.before["zones"]])))
+
+
+def left_of(done: Conclusion, truth: Mapping[str, Any], values: Array) -> list[dict[str, Any]]:
+    """Return what aberrations of (sets, zones, modes) radians, taken off, leave of a simulated bench's exact phase.
+
+    Rms over every zone's light, and the median and the worst of the zones that are valid.
+    """
+    extra = done.extra
+    facts, noll = extra["rig_facts"], extra["noll"]
+    panel = Panel(int(facts["panel_width"]), int(facts["panel_height"]), facts["pitch_m"])
+    diameter = (truth.get("camera") or {}).get("pupil_mm")
+    nominal = Bench.nominal(
+        pupil_diameter_m=facts["pupil_diameter_m"] if diameter is None else 1e-3 * diameter,
+        eye_relief_m=facts["eye_relief_m"],
+    )
+    # Noll terms are those of the nominal pupil, whatever the camera's own stop.
+    scaled = values if diameter is None else _rescaled(values, noll, facts["pupil_diameter_m"] / (1e-3 * diameter))
+    left = residuals_rad(
+        nominal, panel, truth, tangents_of(done), wavelength_m=float(extra["wavelength_nm"]) * 1e-9, noll=noll,
+        coefficients_rad=scaled,
+    )  # fmt: skip
+    valid = np.array([zone["valid"] for zone in done.before["zones"]])
+    return [_summary(one, one[valid & np.isfinite(one)]) for one in left]
+
+
+def _summary(left: Array, counted: Array) -> dict[str, Any]:
+    return {
+        "median": float(np.median(counted)) if len(counted) else None,
+        "worst": float(np.max(counted)) if len(counted) else None,
+        "zones": [float(value) if np.isfinite(value) else None for value in left],
+    }
+
+
+def _rescaled(values: Array, noll: list[int], ratio: float) -> Array:
+    """Return coefficients over a disc `1 / ratio` times as wide that are the same wavefront."""
+    rng = np.random.default_rng(0)
+    angle, radius = rng.uniform(0, 2 * np.pi, 400), np.sqrt(rng.uniform(0, 1, 400))
+    x, y = radius * np.cos(angle), radius * np.sin(angle)
+    highest = list(range(1, max(noll) + 1))
+    wanted = zernike(noll, x / ratio, y / ratio).T @ values.reshape(-1, len(noll)).T
+    found = np.linalg.lstsq(zernike(highest, x, y).T, wanted, rcond=None)[0]
+    return np.asarray(found[[highest.index(j) for j in noll]].T).reshape(values.shape)
+
+
 def residuals_rad(
     nominal: Bench,
     panel: Panel,
@@ -42,11 +101,11 @@ def residuals_rad(
     noll: Sequence[int],
     coefficients_rad: Array,
 ) -> Array:
-    """Return what an estimate of the bench's wavefronts leaves in every direction, (zones,) radians rms; NaN if dark.
+    """Return what estimates of the bench's wavefronts leave in every direction, (..., zones) radians rms; NaN if dark.
 
-    W(x) = phi_nominal_p(x) - phi_true_p'(x) + the panel's own path, p' such that no tilt is left; the estimate
-    (zones, modes) is taken off at the nominal bench's pupil points; piston and tilt are removed. Weighted by the light:
-    what passes the true pupil of what a hologram of the nominal bench sends.
+    W(x) = phi_nominal_p(x) - phi_true_p'(x) + the panel's own path, p' such that no tilt is left; an estimate
+    (..., zones, modes) is taken off at the nominal bench's pupil points; piston and tilt are removed. Weighted by the
+    light: what passes the true pupil of what a hologram of the nominal bench sends.
     """
     bench = true_bench(nominal, truth)
     flatness = truth.get("slm", {}).get("flatness_nm") or []
@@ -57,21 +116,23 @@ def residuals_rad(
     for index, rms_nm in flatness:
         local = x / np.hypot(*half)
         own += 2 * np.pi / wavelength_m * rms_nm * 1e-9 * zernike([index], local[:, 0], local[:, 1])[0]
-    left = [
-        _zone(nominal, bench, x, own, tangent, wavelength_m, noll, found)
-        for tangent, found in zip(field_tan, coefficients_rad, strict=True)
-    ]
-    return np.array(left)
+    estimates = coefficients_rad.reshape(-1, *coefficients_rad.shape[-2:])
+    left = each(
+        lambda zone: _zone(nominal, bench, x, own, field_tan[zone], wavelength_m, noll, estimates[:, zone]),
+        len(field_tan),
+    )
+    return np.stack(left, axis=-1).reshape(coefficients_rad.shape[:-1])
 
 
 def _zone(
     nominal: Bench, bench: Bench, x: Array, own: Array, tangent: Array, wavelength_m: float, noll: Sequence[int],
     coefficients_rad: Array,
-) -> float:  # fmt: skip
+) -> Array:  # fmt: skip
     k, radius = 2 * np.pi / wavelength_m, nominal.pupil_diameter_m / 2
     there = exact_phase(nominal, VirtualPoints.at(tangent), x, wavelength_m=wavelength_m)
     local = there.pupil_m / radius
-    estimated = coefficients_rad @ zernike(noll, local[:, 0], local[:, 1]) if len(noll) else np.zeros(len(x))
+    estimates = coefficients_rad @ zernike(noll, local[:, 0], local[:, 1]) if len(noll) else np.zeros((1, len(x)))
+    dark = np.full(len(coefficients_rad), np.nan)
     sent = soft_disc(there.pupil_m, radius, EDGE_M)
     seen = np.array(tangent, np.float64)
     for _ in range(ROUNDS):
@@ -81,15 +142,15 @@ def _zone(
         amount = amount * np.where(lit, _area(np.nan_to_num(real.pupil_m)), 0.0)
         search = amount if amount.sum() > 0 else np.where(lit, sent**2, 0.0)
         if np.count_nonzero(search) < 6:
-            return float("nan")
+            return dark
         error = np.nan_to_num(there.phase_rad - real.phase_rad) + own
         slope, _ = _without_plane(error, np.nan_to_num(real.pupil_m), search)
         sines = seen / np.sqrt(1 + seen @ seen) - slope / k
         seen = sines / np.sqrt(1 - sines @ sines)
     if np.count_nonzero(amount) < 6:
-        return float("nan")
-    _, rest = _without_plane(error - estimated, np.nan_to_num(there.pupil_m), amount)
-    return float(np.sqrt(np.sum(amount * rest**2) / amount.sum()))
+        return dark
+    rests = [_without_plane(error - estimated, np.nan_to_num(there.pupil_m), amount)[1] for estimated in estimates]
+    return np.array([np.sqrt(np.sum(amount * rest**2) / amount.sum()) for rest in rests])
 
 
 def _without_plane(values: Array, pupil_m: Array, weight: Array) -> tuple[Array, Array]:

@@ -15,6 +15,7 @@ from holocal.estimate.spot_places import SpotPlaces
 from holocal.estimate.zone_data import Noise, Priors, ZoneData, ZoneFit
 from holocal.estimate.zone_fits import fit_zones, pupil_place
 from holocal.optics.zernike import noll_to_nm
+from holocal.threads import each
 from procedures._aberration_directions import better_jacobians, turned, windows_of
 from procedures._aberration_spots import EDGE_M, REACH_M, SpotArray
 
@@ -28,6 +29,7 @@ LARGEST_CHI2 = 3.0  # times the median (at least 1): above, a zone's fit is not 
 LARGEST_OFF = 100.0  # chi-square per mode between a zone and what the others say of it
 # Prior of a picture's stretch once the fits have placed the spots: by many, and by too few for a curved map.
 AFFINE_PLACED, AFFINE_BY_FEW = 0.003, 0.01
+FIRST_LOOK = (0, 1)  # frames of opposite defocus
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,7 @@ class Estimate:
     """What frames say of all zones.
 
     `fits` per zone, None for one that could not be fitted, `reason` why, or why it is not believed; `windows`, `boxes`
-    likewise; `field` joins them; `pupil_m` (2,) where the pupil lies.
+    likewise; `field` joins them; `pupil_m` (2,) where the pupil lies; `affine` how well the pictures' stretch is known.
     """
 
     fits: tuple[ZoneFit | None, ...]
@@ -71,6 +73,7 @@ class Estimate:
     field: FieldModel
     degree: int
     pupil_m: Array
+    affine: float
 
     @property
     def valid(self) -> NDArray[np.bool_]:
@@ -91,43 +94,47 @@ def estimate(
     """Return what frames say of all zones; `before` gives windows and a place to start from."""
     wanted = max(noll_to_nm(j)[0] for j in noll)
     degree = wanted + ABOVE
-    priors = Priors()
+    priors = Priors() if before is None else replace(Priors(), affine=before.affine)
     if before is None:
         windows, reasons = windows_of(array, places)
     else:
         windows = list(before.windows)
         reasons = ["" if window is not None else said for window, said in zip(windows, before.reasons, strict=True)]
-    parts = [_problem(array, windows[z], z, shown, camera, degree, device) for z in range(len(windows))]
+
+    def problem_of(zone: int) -> Part | None:
+        return _problem(array, windows[zone], zone, shown, camera, degree, device)
+
+    parts = each(problem_of, len(windows))
     for zone, part in enumerate(parts):
         if part is not None and _darkness(part[2]) < LEAST_LIGHT:
             parts[zone], reasons[zone] = None, "no light is seen where its spot should be"
     problems = [None if part is None else part[2] for part in parts]
-    started: list[Array | None] | None = None
     if before is not None:
         started = [
             None if fit is None or problem is None else problem.begun_at(fit.vector, fit.layout)
             for fit, problem in zip(before.fits, problems, strict=True)
         ]
-    fits = fit_zones(problems, priors, wanted, started)
-    place = pupil_place(fits)
+        fits = fit_zones(problems, priors, wanted, started)
+    else:  # two frames say where the spots are; then the windows' directions are set right, and all frames fitted
+        fits = fit_zones([None if one is None else one.of_frames(FIRST_LOOK) for one in problems], priors, wanted)
+        place = pupil_place(fits)
+        boxes = [None if part is None else part[1] for part in parts]
+        better = better_jacobians(array, places, windows, boxes, fits, degree, np.zeros(2) if place is None else place)
+        if better is not None:
+            windows, old_parts = turned(array, windows, better[0]), parts
+            parts = each(lambda zone: None if old_parts[zone] is None else problem_of(zone), len(windows))
+            fits = [
+                None if fit is None or old is None or new is None else moved(fit, old[1], new[1], degree)
+                for fit, old, new in zip(fits, old_parts, parts, strict=True)
+            ]
+            priors = replace(priors, affine=AFFINE_PLACED if better[1] else AFFINE_BY_FEW)
+            problems = [None if part is None else part[2] for part in parts]
+        started = [
+            None if fit is None or problem is None else problem.begun_at(fit.vector, fit.layout)
+            for fit, problem in zip(fits, problems, strict=True)
+        ]
+        fits = fit_zones(problems, priors, wanted, started)
     boxes = [None if part is None else part[1] for part in parts]
-    better = better_jacobians(array, places, windows, boxes, fits, degree, np.zeros(2) if place is None else place)
-    if before is None and better is not None:  # the windows' directions set right, and the fits made again
-        windows = turned(array, windows, better[0])
-        started = [None] * len(windows)
-        for zone, (old, fit) in enumerate(zip(parts, fits, strict=True)):
-            if old is None or fit is None:
-                continue
-            parts[zone] = part = _problem(array, windows[zone], zone, shown, camera, degree, device)
-            if part is None:
-                continue
-            problems[zone], boxes[zone] = part[2], part[1]
-            vector = fit.vector.copy()
-            vector[fit.layout.affine] = 0.0
-            vector[fit.layout.wavefront] = rebased(vector[fit.layout.wavefront], old[1], part[1], degree)
-            started[zone] = vector
-        affine = AFFINE_PLACED if better[1] else AFFINE_BY_FEW
-        fits = fit_zones(problems, replace(priors, affine=affine), wanted, started)
     models = [None if part is None else part[0] for part in parts]
     place = pupil_place(fits)
     field, reasons = joined(array, fits, boxes, reasons, degree, noll)
@@ -141,7 +148,15 @@ def estimate(
         field,
         degree,
         np.zeros(2) if place is None else place,
+        priors.affine,
     )
+
+
+def moved(fit: ZoneFit, old: PupilBox, new: PupilBox, degree: int) -> ZoneFit:
+    """Return a fit with its wavefront over another box; only its vector is that of the new one."""
+    vector = fit.vector.copy()
+    vector[fit.layout.wavefront] = rebased(vector[fit.layout.wavefront], old, new, degree)
+    return replace(fit, vector=vector)
 
 
 def rebased(terms: Array, old: PupilBox, new: PupilBox, degree: int) -> Array:

@@ -21,6 +21,7 @@ MOST_ITERATIONS, MOST_TRIES = 12, 8
 Prior = tuple[Array, Array]  # precision and centre of every parameter
 
 ENOUGH = 0.1  # of chi-square: an iteration that gains less was the last
+FORETOLD = 0.2  # of the foretold gain: a step that gains what it should, so nearly, leaves the derivatives as they are
 
 
 class ZoneProblem:
@@ -152,26 +153,46 @@ class ZoneProblem:
         prior = (precision, np.zeros(self.layout.count) if centre is None else centre)
         state = self._at(vector, prior, kernels, highest)
         converged = False
+        fresh = True
         for _ in range(MOST_ITERATIONS):
-            step, value = np.zeros(self.layout.count), np.inf
+            step, value, expected = np.zeros(self.layout.count), np.inf, state.expected
             for _ in range(MOST_TRIES):
                 damped = state.matrix[np.ix_(moving, moving)]
                 damped = damped + damping * np.diag(np.diag(damped))
                 step[moving] = np.linalg.solve(damped, state.right[moving])
-                value = self._objective(self.expected(vector + step), vector + step, prior, kernels, state.sigma)
+                expected = self.expected(vector + step)
+                value = self._objective(expected, vector + step, prior, kernels, state.sigma)
                 if value < state.objective:
                     break
                 damping *= 8
             gain = state.objective - value
             if not gain > 0:
+                if not fresh:  # downhill by old derivatives is not downhill: look again
+                    state, fresh, damping = self._at(vector, prior, kernels, highest), True, 1e-3
+                    continue
                 converged = True
                 break
             vector, damping = vector + step, max(damping / 6, 1e-7)
-            state = self._at(vector, prior, kernels, highest)
-            if gain < ENOUGH:
-                converged = True
+            converged = gain < ENOUGH
+            foretold = float(2 * step @ state.right - step @ state.matrix @ step)
+            fresh = abs(gain - foretold) > FORETOLD * foretold
+            if not fresh:
+                state = self._moved_on(state, vector, expected, prior, kernels)
+            else:
+                state = self._at(vector, prior, kernels, highest)
+            if converged:
                 break
         return self._result(vector, prior, state, converged)
+
+    def _moved_on(
+        self, state: _Linearised, vector: Array, expected: Array, prior: Prior, kernels: tuple[Array, Array] | None
+    ) -> _Linearised:
+        """Return the objective at a vector near by, derivatives and errors as they were."""
+        good = self.data.good
+        residual = (_blurred(np.where(good, self.data.counts - expected, 0.0), kernels) / state.sigma)[good]
+        chi2 = float(residual @ residual)
+        right = state.weighted @ residual - prior[0] * (vector - prior[1])
+        return replace(state, objective=chi2 + _penalty(vector, prior), right=right, chi2=chi2, expected=expected)
 
     def _moving(self, highest: int, *, fine: bool) -> NDArray[np.bool_]:
         moving = np.ones(self.layout.count, np.bool_)
@@ -209,6 +230,8 @@ class ZoneProblem:
             data,
             float(residual @ residual),
             residual.size,
+            weighted,
+            expected,
         )
 
     def _result(self, vector: Array, prior: Prior, state: _Linearised, converged: bool) -> ZoneFit:
@@ -229,7 +252,10 @@ class ZoneProblem:
 
 @dataclass(frozen=True)
 class _Linearised:
-    """The objective at a vector, the pixels' errors, the normal equations and the data's own part, and chi-square."""
+    """The objective at a vector, the pixels' errors, the normal equations and the data's own part, and chi-square.
+
+    `weighted` (parameters, pixels) are the derivatives over the errors, `expected` (frames, rows, columns) the counts.
+    """
 
     objective: float
     sigma: Array
@@ -238,6 +264,8 @@ class _Linearised:
     data: Array
     chi2: float
     pixels: int
+    weighted: Array
+    expected: Array
 
 
 STAGES = ((4.0, 2), (2.0, 3), (1.0, 4))  # blur in pixels, degree of the wavefront

@@ -20,6 +20,8 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any
 
 import finufft
 import numpy as np
@@ -32,7 +34,9 @@ from holocal.optics.bench import Array
 NUFFT_EPS = 1e-4
 MARGIN_PX = 6  # the field is computed over so much more than the window: what W throws into it comes from there
 LEAST_HELD = 0.5  # of the light beside a zone's direction: less is not made up for
-PER_FRINGE = 1.7  # samples per shortest period of the intensity; the pixel's own integral damps what would alias
+SPARE = 1.1  # of the period that the pupil's plane gets by sampled directions, over its box
+# The mean over a pixel is a weighted sum of samples in it and of some beside it; by few samples, and so exactly.
+BESIDE, RULE_ERROR, MOST_SAMPLES = 2, 3e-3, 16
 
 Seen = tuple[Array, NDArray[np.complex64]]  # pupil points (n, 2), values (n,): what `analyse` gives for a zone
 
@@ -169,14 +173,14 @@ class SpotModel:
     ) -> None:
         self.window, self.box, self.pupil, self.degree, self.device = window, box, pupil, degree, device
         per_metre = pupil.wavenumber * window.pixel  # radians per pixel
-        lit = [min(half, pupil.radius_m + pupil.edge_m) for half in box.half_m]
-        self._fine = [int(np.ceil(PER_FRINGE * 2 * half * per_metre / (2 * np.pi) + 1)) for half in lit]
-        wide = [self._offsets(2 * (half + MARGIN_PX) + 1, f) for half, f in zip(window.half, self._fine, strict=True)]
-        # one sample more at each end: an integral over samples asks for the neighbours of its first and last
-        near = [self._offsets(2 * half + 1, f, more=1) for half, f in zip(window.half, self._fine, strict=True)]
+        coarse = [int(np.ceil(SPARE * 2 * half * per_metre / (2 * np.pi))) for half in box.half_m]
+        wide = [_offsets(2 * (half + MARGIN_PX) + 1, f) for half, f in zip(window.half, coarse, strict=True)]
+        rules = [pixel_rule(2 * min(half, pupil.radius_m) * per_metre / (2 * np.pi)) for half in box.half_m]
+        fine = [len(rule) - 2 * BESIDE for rule in rules]
+        near = [_offsets(2 * half + 1, f, more=BESIDE) for half, f in zip(window.half, fine, strict=True)]
         grid = []  # of the pupil's plane: a period of the field's transform over its own width
         for axis in (0, 1):
-            step = 2 * np.pi / (len(wide[axis]) / self._fine[axis]) / per_metre
+            step = 2 * np.pi / (len(wide[axis]) / coarse[axis]) / per_metre
             low, high = box.centre_m[axis] - box.half_m[axis], box.centre_m[axis] + box.half_m[axis]
             grid.append(np.arange(np.ceil(low / step), np.floor(high / step) + 1) * step)
         q = np.stack(np.meshgrid(grid[0], grid[1]), axis=-1) @ box.to_pupil
@@ -186,7 +190,7 @@ class SpotModel:
         moved = np.einsum("yxij,yxj->yxi", relief, turn)
         # (frames, rows, columns, 2), as the rim has it
         self.pupil_m = q @ window.magnified.T + bends[:, None, None, None] * moved
-        self.field = self._complex(np.stack([self._in_pupil(one, wide, grid, per_metre) for one in seen]))
+        self.field = self._complex(self._in_pupil(seen, wide, coarse, grid, per_metre))
         self._out_x = self._complex(np.exp(1j * per_metre * np.outer(grid[0], near[0])))
         self._out_y = self._complex(np.exp(1j * per_metre * np.outer(near[1], grid[1])))
         # The phase k ds r ds / 2 along each axis of the picture; its mixed part is the rim's (`pupil_m`).
@@ -201,7 +205,7 @@ class SpotModel:
         self._way_x, self._way_y = self._complex(ways[0].T), self._complex(ways[1])
         in_x, in_y = (legendre.legvander((grid[a] - box.centre_m[a]) / box.half_m[a], degree) for a in (0, 1))
         self._in_x, self._in_y = (self._real(np.asarray(table.T, np.float64)) for table in (in_x, in_y))
-        over_x, over_y = (_pixel_means(2 * half + 1, f) for half, f in zip(window.half, self._fine, strict=True))
+        over_x, over_y = (_pixel_means(2 * half + 1, rule) for half, rule in zip(window.half, rules, strict=True))
         fall_x, fall_y = (
             np.exp(slope * np.arange(-half, half + 1.0))[:, None]
             for slope, half in zip(window.envelope, window.half, strict=True)
@@ -220,36 +224,37 @@ class SpotModel:
         """How many frames there are."""
         return int(self.field.shape[0])
 
-    @staticmethod
-    def _offsets(pixels: int, fine: int, more: int = 0) -> Array:
-        """Return sample places in pixels from the middle one's centre: `fine` in each pixel, `more` at both ends."""
-        count = pixels * fine + 2 * more
-        return np.asarray((np.arange(count) - (count - 1) / 2) / fine)
-
-    def _in_pupil(self, seen: Seen, wide: list[Array], grid: list[Array], per_metre: float) -> NDArray[np.complex128]:
-        """Return U on the grid of q (rows up, columns), by way of the directions near the zone's own."""
-        q, values = seen
-        angle = (q @ np.linalg.inv(self.box.to_pupil)) * per_metre  # radians per pixel
+    def _in_pupil(
+        self, seen: Sequence[Seen], wide: list[Array], coarse: list[int], grid: list[Array], per_metre: float
+    ) -> NDArray[np.complex64]:
+        """Return U on the grid of q, (frames, rows up, columns), by way of the directions near the zone's own."""
         # The transform's own samples have one at 0; an even number of ours has none.
         counts = [len(w) for w in wide]
-        shift = [0.5 / f if n % 2 == 0 else 0.0 for f, n in zip(self._fine, counts, strict=True)]
-        source = (values * np.exp(1j * (angle @ shift))).astype(np.complex64)
-        steps = [np.mod(angle[:, a] / self._fine[a] + np.pi, 2 * np.pi) - np.pi for a in (0, 1)]
-        there = finufft.nufft2d1(
-            steps[1].astype(np.float32), steps[0].astype(np.float32), source, (counts[1], counts[0]),
-            eps=NUFFT_EPS, isign=1, nthreads=1,
-        )  # fmt: skip
+        shift = [0.5 / f if n % 2 == 0 else 0.0 for f, n in zip(coarse, counts, strict=True)]
         ds = np.stack(np.meshgrid(wide[0], wide[1]), axis=-1) @ self.window.direction.T
-        held = np.sinc(ds @ self.window.block_m * self.pupil.wavenumber / (2 * np.pi)) ** 2
-        there = there / np.prod(np.maximum(held, LEAST_HELD), axis=-1)
-        back_x = np.exp(-1j * per_metre * np.outer(wide[0], grid[0])) / counts[0]
-        back_y = np.exp(-1j * per_metre * np.outer(grid[1], wide[1])) / counts[1]
-        return np.asarray(back_y @ there @ back_x)
+        held = np.prod(np.sinc(ds @ self.window.block_m * self.pupil.wavenumber / (2 * np.pi)) ** 2, axis=-1)
+        made_up = (1 / np.maximum(held, LEAST_HELD**2) / np.prod(counts)).astype(np.float32)
+        back_x = np.exp(-1j * per_metre * np.outer(wide[0], grid[0])).astype(np.complex64)
+        back_y = np.exp(-1j * per_metre * np.outer(grid[1], wide[1])).astype(np.complex64)
+        turn = np.linalg.inv(self.box.to_pupil) * per_metre  # radians per pixel
+        out = np.empty((len(seen), len(grid[1]), len(grid[0])), np.complex64)
+        for frames in _of_one_pupil(seen):
+            angle = seen[frames[0]][0] @ turn
+            steps = [np.mod(angle[:, a] / coarse[a] + np.pi, 2 * np.pi) - np.pi for a in (0, 1)]
+            source = np.stack([seen[frame][1] for frame in frames])
+            if any(shift):
+                source = source * np.exp(1j * (angle @ shift)).astype(np.complex64)
+            there = finufft.nufft2d1(
+                steps[1].astype(np.float32), steps[0].astype(np.float32), source, (counts[1], counts[0]),
+                eps=NUFFT_EPS, isign=1, nthreads=1,
+            )  # fmt: skip
+            out[frames] = back_y @ (there * made_up) @ back_x
+        return out
 
     def _real(self, values: Array) -> torch.Tensor:
         return torch.from_numpy(np.ascontiguousarray(values, np.float32)).to(self.device)
 
-    def _complex(self, values: NDArray[np.complex128]) -> torch.Tensor:
+    def _complex(self, values: NDArray[np.complexfloating[Any, Any]]) -> torch.Tensor:
         return torch.from_numpy(np.ascontiguousarray(values, np.complex64)).to(self.device)
 
     def transmission(self, shift_m: Array) -> tuple[torch.Tensor, torch.Tensor]:
@@ -311,16 +316,56 @@ class SpotModel:
         return self._over_y @ (fine @ self._over_x)
 
 
-def _pixel_means(pixels: int, fine: int) -> Array:
-    """Return the weights (pixels, pixels x fine + 2) of the mean over each pixel of a smooth function's samples.
+def _offsets(pixels: int, fine: int, more: int = 0) -> Array:
+    """Return sample places in pixels from the middle one's centre: `fine` in each pixel, `more` at both ends."""
+    count = pixels * fine + 2 * more
+    return np.asarray((np.arange(count) - (count - 1) / 2) / fine)
 
-    A sample stands for f + f'' / 24 of its own width: over a pixel the second differences cancel but at its ends.
-    Plain sums are too sharp by a variance of 1 / (12 fine^2) pixels squared.
+
+def _of_one_pupil(seen: Sequence[Seen]) -> list[list[int]]:
+    """Return the frames in groups whose light is known at the same points of the pupil."""
+    groups: list[list[int]] = []
+    for frame, (pupil_m, _) in enumerate(seen):
+        for group in groups:
+            if np.array_equal(seen[group[0]][0], pupil_m):
+                group.append(frame)
+                break
+        else:
+            groups.append([frame])
+    return groups
+
+
+def pixel_rule(highest: float) -> Array:
+    """Return weights of samples, those of a pixel and `BESIDE` on each side, whose sum is the mean over the pixel.
+
+    Right to `RULE_ERROR`, by as few samples as that takes, for intensities whose frequencies reach up to `highest`
+    periods per pixel and fall off towards it as those behind a slit do: least squares of the sum's response to the
+    pixel's, sinc(f). A mean of samples would need twice as many each way.
     """
-    weights = np.zeros((pixels, pixels * fine + 2))
+    return _rule(round(float(highest) + 0.005, 2))
+
+
+@lru_cache(maxsize=256)
+def _rule(highest: float) -> Array:
+    f = np.linspace(0, highest, 400)
+    trust = 1 - f / highest
+    weights = np.ones(1)
+    for samples in range(2, MOST_SAMPLES + 1):
+        places = _offsets(1, samples, BESIDE)
+        half = places[places >= -1e-12]  # a rule is symmetric: x and -x together
+        response = np.cos(2 * np.pi * np.outer(f, half)) * np.where(half > 1e-12, 2.0, 1.0)
+        found = np.linalg.lstsq(response * trust[:, None], np.sinc(f) * trust, rcond=1e-6)[0]
+        off = (response @ found - np.sinc(f)) * trust
+        weights = np.concatenate([found[::-1], found[1:] if len(places) % 2 else found])
+        if float(np.sqrt(np.mean(off**2) / np.mean(trust**2))) <= RULE_ERROR:
+            break
+    return weights
+
+
+def _pixel_means(pixels: int, rule: Array) -> Array:
+    """Return the weights (pixels, samples) of the mean over each pixel of a row's samples."""
+    fine = len(rule) - 2 * BESIDE
+    weights = np.zeros((pixels, pixels * fine + 2 * BESIDE))
     for pixel in range(pixels):
-        first, last = 1 + pixel * fine, (pixel + 1) * fine
-        weights[pixel, first : last + 1] += 1.0
-        for at, sign in ((first - 1, 1), (first, -1), (last, -1), (last + 1, 1)):
-            weights[pixel, at] += sign / 24
-    return weights / fine
+        weights[pixel, pixel * fine : pixel * fine + len(rule)] = rule
+    return weights

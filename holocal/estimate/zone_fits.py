@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 
 import numpy as np
-import torch
 
 from holocal.estimate.spot_fit import ZoneProblem, coarse_to_fine
 from holocal.estimate.zone_data import Priors, ZoneFit
 from holocal.optics.bench import Array
+from holocal.threads import each
 
 SURE_M = 1e-4  # a zone knows where the pupil lies if its own error is below this
 OFF_M = 1.5e-4  # a zone whose pupil lies farther from the others' is fitted again
@@ -37,7 +36,7 @@ def fit_zones(
             return problem.fit(start, problem.prior(priors, wanted_degree))
         return coarse_to_fine(problem, priors, wanted_degree)
 
-    fits = _each(first, len(problems))
+    fits = each(first, len(problems))
     place = pupil_place(fits)
     if place is None:
         return fits
@@ -54,7 +53,7 @@ def fit_zones(
         unsure = _pupil_sigma_m(fit) > SURE_M
         return near if unsure or near.chi2 < fit.chi2 * 1.05 else fit
 
-    return _each(again, len(problems))
+    return each(again, len(problems))
 
 
 def pupil_place(fits: Sequence[ZoneFit | None]) -> Array | None:
@@ -69,16 +68,3 @@ def pupil_place(fits: Sequence[ZoneFit | None]) -> Array | None:
 
 def _pupil_sigma_m(fit: ZoneFit) -> float:
     return 1e-3 * float(np.sqrt(np.max(np.diag(fit.covariance)[fit.layout.shift]) * max(fit.chi2, 1.0)))
-
-
-def _each(work: Callable[[int], ZoneFit | None], count: int) -> list[ZoneFit | None]:
-    """Return the work of each zone; a zone to a thread, as its matrices are too small to share."""
-    threads = torch.get_num_threads()
-    if threads == 1:
-        return [work(zone) for zone in range(count)]
-    torch.set_num_threads(1)
-    try:
-        with ThreadPoolExecutor(threads) as pool:
-            return list(pool.map(work, range(count)))
-    finally:
-        torch.set_num_threads(threads)

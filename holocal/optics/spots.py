@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -24,6 +25,7 @@ from holocal.errors import SamplingError
 from holocal.optics.bench import Array, Bench, Panel
 from holocal.optics.phase_function import VirtualPoints, exact_phase
 from holocal.optics.series import Series, fit_series
+from holocal.threads import each
 
 BLOCK = 4  # pixels each way
 _DEGREES = (16, 24, 32)  # of phase and pupil point over the panel
@@ -49,6 +51,11 @@ class SpotWaves:
     def count(self) -> int:
         """How many points there are."""
         return int(self.turns.coefficients.shape[2])
+
+    @cached_property
+    def slopes(self) -> tuple[Series, Series]:
+        """The derivatives of `turns` along x and along y, turns per metre."""
+        return derivative(self.turns, 1), derivative(self.turns, 0)
 
     def with_phase(self, added: PhaseOfPupil) -> SpotWaves:
         """Return the waves with a phase added that is a smooth function of the pupil point, radians.
@@ -142,13 +149,23 @@ def synthesise(
     """
     panel = waves.panel
     columns, rows = (-(-n // block) for n in (panel.width, panel.height))
-    total = torch.zeros((rows, block, columns, block), dtype=torch.complex64, device=device)
-    for point, part in _parts(waves, reach_m, block):
-        centre = part.centre() * (amplitude[point] * window(part.pupil())).astype(np.complex64)
-        along_x, along_y = part.carriers(device)
-        along_y *= torch.from_numpy(centre).to(device)[:, None, :]
-        total[part.rows, :, part.columns] += along_y[..., None] * along_x[:, None]
-    return total.reshape(rows * block, columns * block)[: panel.height, : panel.width].contiguous()
+    total = torch.zeros((block, block, rows, columns), dtype=torch.complex64, device=device)
+    bands = list(_bands(waves, reach_m, block))
+
+    def add(band: int) -> None:
+        for point, part in bands[band]:
+            first, right, down = part.carriers(device)
+            sent = torch.from_numpy((amplitude[point] * window(part.pupil())).astype(np.complex64)).to(device)
+            line = first * sent
+            steps = _powers(right, block)
+            for j in range(block):
+                for k in range(block):
+                    total[j, k, part.rows, part.columns].addcmul_(line, steps[k])
+                line = line * down if j + 1 < block else line
+
+    each(add, len(bands))
+    whole = total.permute(2, 0, 3, 1).reshape(rows * block, columns * block)
+    return whole[: panel.height, : panel.width].contiguous()
 
 
 def analyse(
@@ -168,64 +185,83 @@ def analyse(
     columns, rows = -(-width // block), -(-height // block)
     if (rows * block, columns * block) != (height, width):
         field = torch.nn.functional.pad(field, (0, columns * block - width, 0, rows * block - height))
-    blocks = field.reshape(rows, block, columns, block)
-    sums: dict[int, torch.Tensor] = {}
-    lit: dict[int, tuple[slice, slice]] = {}
-    for point, part in _parts(waves, reach_m, block):
-        if point not in sums:
-            sums[point] = torch.zeros((rows + 1, columns + 1), dtype=torch.complex64, device=field.device)
-        corners = _to_corners(blocks, part)
-        for down, right in ((0, 0), (0, 1), (1, 0), (1, 1)):
-            where = (_moved(part.rows, down), _moved(part.columns, right))
-            sums[point][where] += corners[down][right]
-        before = lit.get(point, (part.rows, part.columns))
-        lit[point] = (_around(before[0], part.rows), _around(before[1], part.columns))
-    found: list[tuple[Array, NDArray[np.complex64]]] = []
+    planes = field.reshape(rows, block, columns, block).permute(1, 3, 0, 2).contiguous()
+    bands = list(_bands(waves, reach_m, block))
     x, y = waves.block_grid(block)
     half = block / 2 * waves.panel.pitch_m
-    x, y = np.append(x - half, x[-1] + half), np.append(y + half, y[-1] - half)
-    for point in range(waves.count):
-        if point not in sums:
-            found.append((np.zeros((0, 2)), np.zeros(0, np.complex64)))
-            continue
-        height_lit, width_lit = (slice(one.start, one.stop + 1) for one in lit[point])
-        part = _Part(waves, point, height_lit, width_lit, x[width_lit], y[height_lit], block)
-        pupil, values = part.pupil(), sums[point][height_lit, width_lit].cpu().numpy()
+    corner_grid = _Grid.of(sent or waves, np.append(x - half, x[-1] + half), np.append(y + half, y[-1] - half))
+
+    def held(point: int) -> tuple[Array, NDArray[np.complex64]]:
+        parts = [part for band in bands for at, part in band if at == point]
+        if not parts:
+            return np.zeros((0, 2)), np.zeros(0, np.complex64)
+        first, last = min(part.columns.start for part in parts), max(part.columns.stop for part in parts)
+        top, bottom = parts[0].rows.start, parts[-1].rows.stop
+        sums = torch.zeros((bottom - top + 1, last - first + 1), dtype=torch.complex64, device=field.device)
+        for part in parts:
+            corners = _to_corners(planes, part)
+            for down, right in ((0, 0), (0, 1), (1, 0), (1, 1)):
+                sums[_moved(part.rows, down - top), _moved(part.columns, right - first)] += corners[down][right]
+        in_rows, in_columns = slice(top, bottom + 1), slice(first, last + 1)
+        whole = _Part(waves, point, in_rows, in_columns, corner_grid, block)
+        pupil, values = whole.pupil(), sums.cpu().numpy()
         if sent is not None:
-            values = values * replace(part, waves=sent).areas()
+            values = values * replace(whole, waves=sent).areas()
         near = np.hypot(pupil[..., 0], pupil[..., 1]) <= reach_m
-        found.append((pupil[near], values[near]))
-    return found
+        return pupil[near], values[near]
+
+    return each(held, waves.count)
 
 
-def _to_corners(blocks: torch.Tensor, part: _Part) -> list[list[torch.Tensor]]:
-    """Return what the blocks of a part add to their corners, [top, bottom][left, right] of (rows, columns) each."""
+def _to_corners(planes: torch.Tensor, part: _Part) -> list[list[torch.Tensor]]:
+    """Return what the blocks of a part add to their corners, [top, bottom][left, right] of (rows, columns) each.
+
+    `planes` (block, block, rows, columns): a pixel of every block after the other. By Horner's rule, sums and sums
+    weighted by the pixel's number at once.
+    """
     block = part.block
-    along_x, along_y = (one.conj() for one in part.carriers(str(blocks.device)))
-    centre = torch.from_numpy(part.centre()).to(blocks.device).conj()
-    share = [(j + 0.5) / block for j in range(block)]  # of a pixel, that goes to the farther corner
-    whole = bottom = None
-    for j in range(block):
-        line = blocks[part.rows, j, part.columns] * along_y[:, j, :, None]
-        whole = line if whole is None else whole + line
-        bottom = share[j] * line if bottom is None else bottom + share[j] * line
-    assert whole is not None
-    assert bottom is not None
-    out = []
-    for held in (whole - bottom, bottom):
-        turned = held * along_x
-        total = torch.sum(turned, dim=-1) * centre
-        right = torch.sum(turned * torch.tensor(share, device=blocks.device), dim=-1) * centre
-        out.append([total - right, right])
-    return out
+    first, right, down = (one.conj().resolve_conj() for one in part.carriers(str(planes.device)))
+    here = planes[:, :, part.rows, part.columns]
+    lines = [_moments([here[j, k] for k in range(block)], right) for j in range(block)]
+    whole, to_bottom = _moments([line[0] for line in lines], down)
+    of_right, of_both = _moments([line[1] for line in lines], down)
+    corners = [[whole - of_right - to_bottom + of_both, of_right - of_both], [to_bottom - of_both, of_both]]
+    return [[one * first for one in line] for line in corners]
+
+
+def _moments(values: list[torch.Tensor], step: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return sum_k v_k step^k, and the same with each weighted by (k + 1/2) / n, its share for the farther corner."""
+    total, slope = values[-1], torch.zeros_like(values[-1])
+    for value in reversed(values[:-1]):
+        slope = torch.addcmul(total, slope, step)
+        total = torch.addcmul(value, total, step)
+    return total, (slope * step + 0.5 * total) / len(values)
 
 
 def _moved(part: slice, by: int) -> slice:
     return slice(part.start + by, part.stop + by)
 
 
-def _around(one: slice, other: slice) -> slice:
-    return slice(min(one.start, other.start), max(one.stop, other.stop))
+@dataclass(frozen=True)
+class _Grid:
+    """Chebyshev polynomials at x (columns, terms) and y (rows, terms): what a series of a wave needs on this grid."""
+
+    in_x: Array
+    in_y: Array
+
+    @classmethod
+    def of(cls, waves: SpotWaves, x_m: Array, y_m: Array) -> _Grid:
+        """Return the tables for the series of waves."""
+        series = waves.turns
+        rows, columns = np.maximum(series.coefficients.shape[:2], waves.pupil.coefficients.shape[:2])
+        in_x = chebyshev.chebvander((x_m - series.centre[0]) / series.half[0], int(columns) - 1)
+        in_y = chebyshev.chebvander((y_m - series.centre[1]) / series.half[1], int(rows) - 1)
+        return cls(np.asarray(in_x, np.float64), np.asarray(in_y, np.float64))
+
+    def at(self, coefficients: Array, rows: slice, columns: slice) -> Array:
+        """Return the values (rows, columns) of a series with coefficients (terms in y, terms in x)."""
+        of_y, of_x = coefficients.shape
+        return np.asarray(self.in_y[rows, :of_y] @ (coefficients @ self.in_x[columns, :of_x].T))
 
 
 @dataclass(frozen=True)
@@ -236,46 +272,39 @@ class _Part:
     point: int
     rows: slice
     columns: slice
-    x_m: Array
-    y_m: Array
+    grid: _Grid
     block: int
 
     def pupil(self) -> Array:
         """Return q of the blocks' centres, (rows, columns, 2)."""
-        return self._of(self.waves.pupil).on_grid(self.x_m, self.y_m)
-
-    def centre(self) -> NDArray[np.complex64]:
-        """Return exp(i phi) at the blocks' centres."""
-        turns = self._of(self.waves.turns).on_grid(self.x_m, self.y_m)
-        return _phasor(2 * np.pi * (turns - np.round(turns))).numpy()
+        return np.stack([self._at(self.waves.pupil.coefficients[..., axis]) for axis in (0, 1)], axis=-1)
 
     def areas(self) -> NDArray[np.float32]:
         """Return what a pixel's area sends of the wave, (rows, columns), 1 for light that is not turned."""
-        series, panel = self._of(self.waves.turns), self.waves.panel
-        made = np.ones((1, 1))
-        for axis, own in zip((1, 0), panel.illumination_frequency_per_m, strict=True):
-            turned = derivative(series, axis).on_grid(self.x_m, self.y_m) - own
-            made = made * np.sinc(turned * panel.pitch_m)
-        return np.asarray(made, np.float32)
+        panel = self.waves.panel
+        made = np.ones((1, 1), np.float32)
+        for series, own in zip(self.waves.slopes, panel.illumination_frequency_per_m, strict=True):
+            turned = (self._at(series.coefficients) - own) * panel.pitch_m
+            made = made * torch.sinc(torch.from_numpy(turned.astype(np.float32))).numpy()
+        return made
 
-    def carriers(self, device: str) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the plane wave's factors along x (rows, columns, block) and along y (rows, block, columns)."""
-        series, pitch = self._of(self.waves.turns), self.waves.panel.pitch_m
-        half = np.pi * pitch  # of a pixel, radians per turn per metre
-        slope_x = derivative(series, 1).on_grid(self.x_m, self.y_m) * half
-        slope_y = derivative(series, 0).on_grid(self.x_m, self.y_m) * half
-        steps = np.arange(1 - self.block, self.block, 2)  # in halves of a pixel; rows run down
-        along_x = torch.stack(_powers(_phasor(slope_x).to(device), steps), dim=2)
-        along_y = torch.stack(_powers(_phasor(slope_y).to(device), -steps), dim=1)
-        return along_x, along_y
+    def carriers(self, device: str) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return the wave at the blocks' first pixels (top left), and its factors for a pixel to the right and down."""
+        pitch = self.waves.panel.pitch_m
+        right, up = (pitch * self._at(series.coefficients) for series in self.waves.slopes)
+        first = self._at(self.waves.turns.coefficients) - (self.block - 1) / 2 * (right - up)
+        phasors = (_phasor(2 * np.pi * (one - np.round(one))) for one in (first, right, -up))  # rows run down, y up
+        first_there, right_there, down_there = (one.to(device) for one in phasors)
+        return first_there, right_there, down_there
 
-    def _of(self, series: Series) -> Series:
-        return replace(series, coefficients=series.coefficients[:, :, self.point])
+    def _at(self, coefficients: Array) -> Array:
+        return self.grid.at(coefficients[:, :, self.point], self.rows, self.columns)
 
 
-def _parts(waves: SpotWaves, reach_m: float, block: int) -> Iterator[tuple[int, _Part]]:
-    """Yield each point's wave in bands of blocks, cut to where its light crosses the pupil within reach."""
+def _bands(waves: SpotWaves, reach_m: float, block: int) -> Iterator[list[tuple[int, _Part]]]:
+    """Yield the waves of a band of blocks, each cut to where its light crosses the pupil within reach."""
     x, y = waves.block_grid(block)
+    grid = _Grid.of(waves, x, y)
     for first in range(0, len(y), _BAND):
         rows = slice(first, min(first + _BAND, len(y)))
         coarse_x, coarse_y = x[:: max(1, len(x) // 64)], y[rows][:: max(1, _BAND // 8)]
@@ -286,14 +315,16 @@ def _parts(waves: SpotWaves, reach_m: float, block: int) -> Iterator[tuple[int, 
             np.abs(np.diff(pupil, axis=0)), initial=0.0
         )
         near = np.hypot(pupil[..., 0], pupil[..., 1]).min(axis=0) <= reach_m + margin
+        band = []
         for point in range(waves.count):
             if not near[:, point].any():
                 continue
             low, high = coarse_x[near[:, point]][[0, -1]]
             step = coarse_x[1] - coarse_x[0] if len(coarse_x) > 1 else 0.0
             inside = np.flatnonzero((x >= low - step) & (x <= high + step))
-            columns = slice(int(inside[0]), int(inside[-1]) + 1)
-            yield point, _Part(waves, point, rows, columns, x[columns], y[rows], block)
+            band.append((point, _Part(waves, point, rows, slice(int(inside[0]), int(inside[-1]) + 1), grid, block)))
+        if band:
+            yield band
 
 
 def derivative(series: Series, axis: int) -> Series:
@@ -307,10 +338,9 @@ def _phasor(phase_rad: Array) -> torch.Tensor:
     return torch.polar(torch.ones_like(phase), phase)
 
 
-def _powers(base: torch.Tensor, exponents: NDArray[np.int64]) -> list[torch.Tensor]:
-    """Return powers of phasors with odd or even whole exponents; a negative one is a conjugate."""
-    made: dict[int, torch.Tensor] = {0: torch.ones_like(base), 1: base}
-    square = base * base
-    for n in range(2, int(np.max(np.abs(exponents), initial=0)) + 1):
-        made[n] = square if n == 2 else made[n - 2] * square
-    return [made[n] if n >= 0 else made[-n].conj().resolve_conj() for n in (int(e) for e in exponents)]
+def _powers(base: torch.Tensor, count: int) -> list[torch.Tensor]:
+    """Return the powers 0 to count - 1."""
+    made = [torch.ones_like(base)]
+    for _ in range(count - 1):
+        made.append(made[-1] * base)
+    return made
