@@ -15,6 +15,7 @@ from procedures._aberration_spots import EDGE_M, SpotArray, soft_disc
 Array = NDArray[np.float64]
 
 MARGIN_PX = 5  # of a window round a spot: what an aberration of 4 rad throws out
+LEAST_INSIDE_PX = 3  # of a spot's middle from the picture's edge
 WELL_PLACED = 9  # zones whose fits place them: from as many on the map between is known
 WELL_PLACED_CHI2 = 3.0  # times the median: a fit that is no worse places its spot
 
@@ -34,7 +35,8 @@ def windows_of(array: SpotArray, places: SpotPlaces) -> tuple[list[Window | None
             spread = array.wavelength_m / (2 * array.half_m[zone]) / array.pixel_tan
             half = np.ceil(extent + 0.6 * np.minimum(spread, 15.0) + MARGIN_PX).astype(int)
             column, row = (round(float(v)) for v in places.seen[zone])
-            inside = half[0] <= column < camera.width - half[0] and half[1] <= row < camera.height - half[1]
+            least = np.minimum(half, LEAST_INSIDE_PX)  # beyond the picture's edge a window has no good pixels
+            inside = least[0] <= column < camera.width - least[0] and least[1] <= row < camera.height - least[1]
             if inside:
                 window = window_at(array, zone, (column, row), (int(half[0]), int(half[1])), jacobians[zone])
             else:

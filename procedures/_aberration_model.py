@@ -35,8 +35,8 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Pictures = NDArray[np.uint16]
 
-MEASURED = (-1.0, 0.0, 1.0)  # defocus of the frames after the first
-VERIFIED = (1.0, 0.0)
+MEASURED = (-1.0, 0.0)  # defocus of the frames after the first
+VERIFIED = (1.0, -1.0, 0.0)  # a pair tells wavefronts, the sharp one is looked at
 BURST = (1.0, -1.0)  # of a further step
 VERIFICATION = 1000  # the step number that seeds the verification's phases
 WANTED_PEAK = 1.3  # of full scale, of a spot's brightest pixels: those that clip are left out, the others gain light

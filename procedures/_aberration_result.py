@@ -26,6 +26,7 @@ from procedures._aberration_light import (
     seen_in,
 )
 from procedures._aberration_pictures import extent_of, figures_of, maps_of, mosaic_of
+from procedures._aberration_posterior import posterior_of_zone
 from procedures._aberration_spots import SpotArray
 from procedures._aberration_zones import CameraNoise, Estimate, Shown, estimate
 
@@ -128,9 +129,13 @@ def conclusion(state: State, fresh: State) -> Conclusion:
     median, worst = after["median"]["wavefront_rms_rad"], after["worst"]["wavefront_rms_rad"]
     believed = int(check.valid.sum())
     lit = int(array.on.sum())
-    failed = [zone for zone in np.flatnonzero(array.on) if not found.valid[zone] or not check.valid[zone]]
+    unseen = [zone for zone in np.flatnonzero(array.on) if found.fits[zone] is None]
+    failed = [
+        zone for zone in np.flatnonzero(array.on)
+        if found.fits[zone] is not None and not (found.valid[zone] and check.valid[zone])
+    ]  # fmt: skip
     met = believed > 0 and median <= chosen.target_median_rad and worst <= chosen.target_worst_rad
-    met = met and len(failed) <= lit // 5
+    met = met and len(failed) <= (lit - len(unseen)) // 5 and len(unseen) <= lit // 2
     sentence = (
         f"wavefront {before['median']['wavefront_rms_rad']:.3f} -> {median:.3f} rad rms (median of {believed} zones; "
         f"target {chosen.target_median_rad:g}), worst {worst:.3f} (target {chosen.target_worst_rad:g}), sharpness "
@@ -138,9 +143,12 @@ def conclusion(state: State, fresh: State) -> Conclusion:
     )
     if failed:
         sentence += f"; {len(failed)} of {lit} lit zones are not believed and take the others' prediction"
+    if unseen:
+        sentence += f"; {len(unseen)} of {lit} zones that should be lit are not in the picture"
     extent = extent_of(state)
     maps, units = maps_of(state, found.valid)
     mosaics = mosaic_of(state, found), mosaic_of(fresh, check)
+    sampled = posterior_of_zone(state, found) if chosen.posterior else None
     return Conclusion(
         before=before,
         after=after,
@@ -173,8 +181,12 @@ def conclusion(state: State, fresh: State) -> Conclusion:
             "zones_lit": lit,
             "zones_believed": believed,
             "rig_facts": geometry_of(state),
+            "posterior": None if sampled is None else sampled[1],
         },
-        figures=figures_of(chosen, mosaics, found.valid, before, after, extent),
+        figures=(
+            *figures_of(chosen, mosaics, found.valid, before, after, extent),
+            *(() if sampled is None else (sampled[0],)),
+        ),
     )
 
 

@@ -116,7 +116,8 @@ def residuals_rad(
     for index, rms_nm in flatness:
         local = x / np.hypot(*half)
         own += 2 * np.pi / wavelength_m * rms_nm * 1e-9 * zernike([index], local[:, 0], local[:, 1])[0]
-    estimates = coefficients_rad.reshape(-1, *coefficients_rad.shape[-2:])
+    sets = int(np.prod(coefficients_rad.shape[:-2]))
+    estimates = coefficients_rad.reshape(sets, *coefficients_rad.shape[-2:])
     left = each(
         lambda zone: _zone(nominal, bench, x, own, field_tan[zone], wavelength_m, noll, estimates[:, zone]),
         len(field_tan),
@@ -131,7 +132,9 @@ def _zone(
     k, radius = 2 * np.pi / wavelength_m, nominal.pupil_diameter_m / 2
     there = exact_phase(nominal, VirtualPoints.at(tangent), x, wavelength_m=wavelength_m)
     local = there.pupil_m / radius
-    estimates = coefficients_rad @ zernike(noll, local[:, 0], local[:, 1]) if len(noll) else np.zeros((1, len(x)))
+    estimates = np.zeros((len(coefficients_rad), len(x)))
+    if len(noll):
+        estimates = coefficients_rad @ zernike(noll, local[:, 0], local[:, 1])
     dark = np.full(len(coefficients_rad), np.nan)
     sent = soft_disc(there.pupil_m, radius, EDGE_M)
     seen = np.array(tangent, np.float64)
@@ -146,6 +149,8 @@ def _zone(
         error = np.nan_to_num(there.phase_rad - real.phase_rad) + own
         slope, _ = _without_plane(error, np.nan_to_num(real.pupil_m), search)
         sines = seen / np.sqrt(1 + seen @ seen) - slope / k
+        if not sines @ sines < 1:  # the light is seen along no direction at all
+            return dark
         seen = sines / np.sqrt(1 - sines @ sines)
     if np.count_nonzero(amount) < 6:
         return dark

@@ -33,8 +33,9 @@ MODES: dict[str, Mode] = {"model": ModelMode(), "search": SearchMode(), "sweep":
 class Parameters(BaseModel):
     """What may be chosen. `noll_max` is the last Noll index that is corrected, the first is 4.
 
-    `max_steps` is of mode model, `search_passes` of mode search (a pass is 32 frames for 12 modes); the `sweep_`
-    parameters are of mode sweep: coefficients of one polynomial over the whole pupil, radians.
+    `max_steps` is of mode model, as is `posterior`: to sample a zone's posterior, which takes a minute more.
+    `search_passes` is of mode search (a pass is 32 frames for 12 modes); the `sweep_` parameters are of mode sweep:
+    coefficients of one polynomial over the whole pupil, radians.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -46,6 +47,7 @@ class Parameters(BaseModel):
     target_median_rad: float = Field(default=0.05, gt=0.0)
     target_worst_rad: float = Field(default=0.15, gt=0.0)
     max_steps: int = Field(default=3, ge=2, le=10)
+    posterior: bool = False
     search_passes: int = Field(default=3, ge=1, le=5)
     sweep_noll: int = Field(default=4, ge=4, le=36)
     sweep_from_rad: float = Field(default=-3.0, ge=-20.0, le=20.0)

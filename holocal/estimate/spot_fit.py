@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from holocal.estimate.spot_model import SpotModel, products
 from holocal.estimate.zone_data import Layout, Noise, Priors, ZoneData, ZoneFit
 from holocal.optics.bench import Array
+from holocal.threads import each
 
 MOST_ITERATIONS, MOST_TRIES = 12, 8
 Prior = tuple[Array, Array]  # precision and centre of every parameter
@@ -125,6 +126,19 @@ class ZoneProblem:
         start = np.zeros(self.layout.count)
         start[: layout.shift.stop] = vector[: layout.shift.stop]
         return start
+
+    def log_posterior(self, vectors: Array, about: Array, precision: Array) -> Array:
+        """Return the logarithm of the posterior (n,) of vectors (n, parameters), but for a constant.
+
+        Pixels' errors are those of the vector `about` (parameters,); `precision` is of the prior round 0.
+        """
+        prior = (precision, np.zeros(self.layout.count))
+        sigma = self._sigma(self.expected(about), None)
+
+        def one(k: int) -> float:
+            return -0.5 * self._objective(self.expected(vectors[k]), vectors[k], prior, None, sigma)
+
+        return np.array(each(one, len(vectors)))
 
     def fit(
         self,

@@ -21,7 +21,7 @@ import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Any
+from typing import Any, TypeVar
 
 import finufft
 import numpy as np
@@ -38,6 +38,7 @@ SPARE = 1.1  # of the period that the pupil's plane gets by sampled directions, 
 # The mean over a pixel is a weighted sum of samples in it and of some beside it; by few samples, and so exactly.
 BESIDE, RULE_ERROR, MOST_SAMPLES = 2, 3e-3, 16
 
+Value = TypeVar("Value", bound=np.generic)
 Seen = tuple[Array, NDArray[np.complex64]]  # pupil points (n, 2), values (n,): what `analyse` gives for a zone
 
 
@@ -70,10 +71,14 @@ class Window:
         """Rows, columns."""
         return 2 * self.half[1] + 1, 2 * self.half[0] + 1
 
-    def cut(self, picture: NDArray[np.generic]) -> NDArray[np.generic]:
-        """Return the window's pixels of a picture (height, width)."""
+    def cut(self, picture: NDArray[Value]) -> NDArray[Value]:
+        """Return the window's pixels of a picture (height, width); 0 where it reaches beyond."""
         x, y = self.half
-        return picture[self.row - y : self.row + y + 1, self.column - x : self.column + x + 1]
+        rows, columns = np.arange(self.row - y, self.row + y + 1), np.arange(self.column - x, self.column + x + 1)
+        within = [(at >= 0) & (at < size) for at, size in zip((rows, columns), picture.shape, strict=True)]
+        out = np.zeros(self.shape, picture.dtype)
+        out[np.ix_(*within)] = picture[np.ix_(rows[within[0]], columns[within[1]])]
+        return out
 
     @property
     def pixel(self) -> float:

@@ -82,6 +82,15 @@ def test_a_bench_out_of_line_is_corrected_in_six_frames(found):
     assert set(zones[4]["coefficients_rad"]) == {str(j) for j in range(4, 16)}
 
 
+@pytest.mark.slow
+def test_the_posterior_of_a_zone_confirms_its_laplace_errors(tmp_path):
+    done, _ = go(SimulatedRig(tables()), tmp_path, posterior=True)
+    said = done.result["posterior"]
+    assert said["converged"] and 0.2 < said["acceptance"] < 0.8
+    assert said["autocorrelation_steps"] < 12
+    assert 0.9 < said["sigma_ratio"]["least"] <= said["sigma_ratio"]["most"] < 1.3
+
+
 def test_the_wavefront_before_is_what_the_bench_has(found):
     result = found[0].result
     for zone, true in zip(result["before"]["zones"], result["truth"]["before_rms_rad"]["zones"], strict=True):

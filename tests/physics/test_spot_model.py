@@ -5,7 +5,7 @@ import pytest
 
 from holocal.estimate.field_model import fit_field, legendre_of_noll, modes_of, zone_evidence
 from holocal.estimate.spot_fit import ZoneProblem, coarse_to_fine
-from holocal.estimate.spot_model import Pupil, PupilBox, SpotModel, Window, products
+from holocal.estimate.spot_model import BESIDE, Pupil, PupilBox, SpotModel, Window, pixel_rule, products
 from holocal.estimate.zone_data import Noise, Priors, ZoneData
 from holocal.optics.zernike import zernike
 
@@ -260,3 +260,33 @@ def test_evidence_of_a_fit_is_its_own_answer():
     ]
     one, other = (v - plane @ np.linalg.lstsq(plane, v, rcond=None)[0] for v in both)
     assert (one - other).std() < 0.02
+
+
+@pytest.mark.parametrize("periods", [0.4, 1.3, 2.0, 3.4])
+def test_few_weighted_samples_are_the_mean_over_a_pixel(periods):
+    """A slit's intensity at random places: its frequencies reach `periods` per pixel and fall off towards it."""
+    rule = pixel_rule(periods)
+    assert abs(rule.sum() - 1) < 3e-3 and np.allclose(rule, rule[::-1])
+    rng = np.random.default_rng(3)
+    fine = len(rule) - 2 * BESIDE
+    places = (np.arange(len(rule)) - (len(rule) - 1) / 2) / fine
+    node, weight = np.polynomial.legendre.leggauss(60)
+    off, size = [], []
+    for _ in range(60):
+        amplitude = rng.normal(size=24) + 1j * rng.normal(size=24)
+        frequency = rng.uniform(-periods / 2, periods / 2, 24)
+
+        def light(at, a=amplitude, f=frequency):
+            return np.abs(np.exp(2j * np.pi * np.outer(at, f)) @ a) ** 2
+
+        exact = float(weight @ light(node / 2)) / 2
+        off.append(float(rule @ light(places)) - exact)
+        size.append(exact)
+    assert np.sqrt(np.mean(np.square(off))) < 6e-3 * np.sqrt(np.mean(np.square(size)))
+
+
+def test_a_window_beyond_the_picture_is_dark_there():
+    picture = np.arange(1.0, 13.0).reshape(3, 4)
+    window = Window(3, 0, (1, 1), DIRECTION, RELIEF_M)
+    assert window.cut(picture).tolist() == [[0.0, 0.0, 0.0], [3.0, 4.0, 0.0], [7.0, 8.0, 0.0]]
+    assert not window.cut(np.ones((3, 4), np.bool_))[0].any()
