@@ -135,7 +135,7 @@ def conclusion(state: State, fresh: State) -> Conclusion:
         if found.fits[zone] is not None and not (found.valid[zone] and check.valid[zone])
     ]  # fmt: skip
     met = believed > 0 and median <= chosen.target_median_rad and worst <= chosen.target_worst_rad
-    met = met and len(failed) <= (lit - len(unseen)) // 5 and len(unseen) <= lit // 2
+    met = met and len(failed) <= max((lit - len(unseen)) // 5, 1) and len(unseen) <= lit // 2
     sentence = (
         f"wavefront {before['median']['wavefront_rms_rad']:.3f} -> {median:.3f} rad rms (median of {believed} zones; "
         f"target {chosen.target_median_rad:g}), worst {worst:.3f} (target {chosen.target_worst_rad:g}), sharpness "

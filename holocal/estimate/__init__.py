@@ -22,5 +22,12 @@ mirrored_pictures
 model_free      the aberration of every zone without a model: plan, trials, steps
 model_free_state, model_free_result
                 its plan and state; what it found, how sure, what did not work
+dot_grid        a regular grid of dots in a picture: found, indexed, mapped
+dot_scale, dot_detection, dot_fit
+                the dots' size and sign; which spots are dots; their centres
+dot_indexing, lattice_prediction
+                rows and columns; where a cell should be, from its neighbours
+smooth_map, map_fit, map_basis
+                a smooth map of the plane with its error and inverse; its fit; its terms
 ==============  ===========================================================================
 """

@@ -31,6 +31,7 @@ def test_help_imports_nothing_heavy():
         "verify",
         "render",
         "capture",
+        "detect-grid",
         "bench",
         "rigs",
         "procedures",

@@ -1,0 +1,279 @@
+"""Dots of either sign and unknown size in a grey picture: where, how sure, and which look like their neighbours.
+
+The size comes from `dot_scale`, the centres from `dot_fit`, in two rounds: what the first finds round a dot is what the
+second expects of it, so that perspective and blur may change over the picture while a stain stays a stain.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from holocal.estimate.dot_fit import DiscFits, Shapes, fit_discs
+from holocal.estimate.dot_scale import AGREEING, DotScale, candidates, dot_scales, laplacian, lattice_agreement, refined
+
+Array = NDArray[np.float64]
+Single = NDArray[np.float32]
+
+RADIUS_OF_SIGMA = 2**0.5  # a disc answers best to a Laplacian of Gaussian of radius / sqrt(2)
+RADIUS_KEPT_PX = 4.5  # pixels are averaged down to about this radius: the time is bounded, no precision is lost
+SHARE = 0.5  # of the local rms response: fainter maxima are no dots
+NEIGHBOURS = 24
+FIRST_EDGE = 8.0
+FIRST_OPACITY = 0.8
+WINDOW_OF_SPACING = 0.58  # a window ends before the next dot's edge
+WINDOW_OF_RADIUS = 1.1
+RIM = 6.0  # of an edge k the profile is down to 5 % at sqrt(1 + 6 / k) radii
+WINDOW_MORE_PX = 2.0
+WHOLE = 1.15  # radii, the blurred edge included, that must lie inside the picture
+DOUBT = 2.0  # times what a sure dot may differ
+LOOKED_AT = 150  # dots, before all are fitted
+CLEAN = 0.15  # of the contrast: a larger misfit is no guide to sizes
+FIRST_SIZES = (0.8, 1.1, 1.5)  # of the radius that the filter suggests
+LOOK_ITERATIONS = 7
+SIZES_DIFFER = 1.5  # largest over smallest radius: above, dots of other sizes may have been missed
+SIZE_STEP = 1.6
+APART = 1.2  # sigmas between two dots
+LEAST = 9  # dots
+
+
+@dataclass(frozen=True)
+class Dots:
+    """Dots of a picture.
+
+    `centre_px` (n, 2) as (x, y), (0, 0) the centre of the top left pixel; `sigma_px` (n,) of each coordinate;
+    `radius_px` (n,); `contrast` (n,): a dark dot's step over its ground, a bright one's in the picture's unit;
+    `spacing_px` (n,) the distance of neighbours thereabouts; `doubtful` (n,): not quite like their neighbours, as where
+    the     light ends; `dark`: darker than the ground.
+    """
+
+    centre_px: Array
+    sigma_px: Array
+    radius_px: Array
+    contrast: Array
+    spacing_px: Array
+    doubtful: NDArray[np.bool_]
+    dark: bool
+
+    def __len__(self) -> int:
+        return len(self.centre_px)
+
+
+def find_dots(image: Single) -> Dots:
+    """Return the dots of a grey picture (height, width), linear in light; none where nothing forms a lattice.
+
+    Dots that the picture's edge cuts off, and spots unlike those around them in size, form or contrast, are left out.
+    """
+    picture = np.ascontiguousarray(image, np.float32)
+    seen = [look for scale in dot_scales(picture) if (look := _look(picture, scale)) is not None]
+    if not seen:
+        return _none(dark=True)
+    best = min(seen, key=lambda look: look.misfit)  # gaps between fat dots form a lattice too, but are no discs
+    factor = best.factor
+    found = _of_starts(_binned(picture, factor), best.starts, best.dark)
+    return Dots(
+        centre_px=(found.centre_px + 0.5) * factor - 0.5,
+        sigma_px=found.sigma_px * factor,
+        radius_px=found.radius_px * factor,
+        contrast=found.contrast,
+        spacing_px=found.spacing_px * factor,
+        doubtful=found.doubtful,
+        dark=found.dark,
+    )
+
+
+@dataclass(frozen=True)
+class _Starts:
+    """Where dots may be: `place` (n, 2), `radius`, `spacing` (n,) thereabouts, `good` (n,): amid a lattice; `edge`."""
+
+    place: Array
+    radius: Array
+    spacing: Array
+    good: NDArray[np.bool_]
+    edge: float = FIRST_EDGE
+
+    def some(self, most: int) -> _Starts:
+        """Return at most so many of the good ones."""
+        good = np.flatnonzero(self.good)
+        chosen = good[:: max(1, len(good) // most)]
+        return _Starts(self.place[chosen], self.radius[chosen], self.spacing[chosen], self.good[chosen])
+
+
+@dataclass(frozen=True)
+class _Look:
+    """A first look at dots of one sign: where they may be in the picture binned by `factor`; how ill discs fit them."""
+
+    starts: _Starts
+    factor: int
+    dark: bool
+    misfit: float
+
+
+def _look(picture: Single, scale: DotScale) -> _Look | None:
+    """Return a look at a few dots of a scale, and the places of all, of several sizes where the few differ in size."""
+    factor = max(1, int(RADIUS_OF_SIGMA * scale.sigma_px / RADIUS_KEPT_PX))
+    image, sigma = _binned(picture, factor), scale.sigma_px / factor
+    starts = _starts(image, (sigma,), scale.dark)
+    if starts is None:
+        return None
+    few = starts.some(LOOKED_AT)
+    opacity = FIRST_OPACITY if scale.dark else 0.0
+    misfit, fits = np.inf, None
+    for size in FIRST_SIZES:  # from too small a disc a fat dot's rim looks like a stain
+        tried = replace(few, radius=np.minimum(few.radius * size, 0.45 * few.spacing))
+        fitted = _fitted(image, few.place, _first_shapes(tried), few.spacing, opacity, iterations=LOOK_ITERATIONS)
+        left = float(np.median(fitted.residual / np.maximum(np.abs(fitted.amplitude), 1e-12)))
+        if left < misfit:
+            misfit, fits = left, fitted
+    if fits is None:
+        return None
+    if misfit > CLEAN:  # speckle: a free fit takes a grain for the spot
+        return _Look(starts, factor, scale.dark, misfit)
+    small, large = np.quantile(fits.shapes.radius_px, [0.05, 0.95])
+    if large > SIZES_DIFFER * small:
+        starts = _starts(image, (sigma / SIZE_STEP, sigma, sigma * SIZE_STEP), scale.dark) or starts
+    larger = float(np.median(fits.shapes.radius_px / few.radius))
+    radius = np.minimum(starts.radius * larger, 0.45 * starts.spacing)
+    starts = replace(starts, radius=radius, edge=float(np.median(fits.shapes.edge)))
+    return _Look(starts, factor, scale.dark, misfit)
+
+
+def _starts(image: Single, sigmas: tuple[float, ...], dark: bool) -> _Starts | None:
+    """Return the extrema of Laplacians of one or several sizes, of each group of close ones the strongest."""
+    found = []
+    for sigma in sigmas:
+        response = laplacian(image, sigma, dark=dark)
+        at, strength = candidates(response, sigma, share=SHARE)
+        found.append((refined(response, at), strength, np.full(len(at), sigma)))
+    place, strength, size = (np.concatenate(column) for column in zip(*found, strict=True))
+    if len(sigmas) > 1:
+        kept = np.ones(len(place), bool)
+        pairs = cKDTree(place).query_pairs(APART * max(sigmas), output_type="ndarray")
+        near = np.linalg.norm(place[pairs[:, 0]] - place[pairs[:, 1]], axis=1) < APART * size[pairs].max(axis=1)
+        first, second = pairs[near].T
+        kept[np.where(strength[first] < strength[second], first, second)] = False
+        place, size = place[kept], size[kept]
+    if len(place) < LEAST + 1:
+        return None
+    agreeing, first_step, second_step = lattice_agreement(place, np.arange(len(place)))
+    good = agreeing >= AGREEING
+    if np.count_nonzero(good) < AGREEING:
+        return None
+    nearest = np.minimum(np.linalg.norm(first_step, axis=1), np.linalg.norm(second_step, axis=1))
+    spacing = _of_neighbours(place, nearest[:, None], good)[0][:, 0]
+    return _Starts(place, np.minimum(RADIUS_OF_SIGMA * size, 0.45 * spacing), spacing, good)
+
+
+def _first_shapes(starts: _Starts) -> Shapes:
+    count = len(starts.place)
+    return Shapes(starts.radius, np.zeros((count, 2)), np.full(count, starts.edge))
+
+
+def _fitted(
+    image: Single,
+    place: Array,
+    shapes: Shapes,
+    spacing: Array,
+    opacity: float,
+    *,
+    iterations: int = 2,
+    rough: bool = False,
+) -> DiscFits:
+    widest = np.maximum(WINDOW_OF_SPACING * spacing, 2.5)
+    rim = np.sqrt(1 + RIM / shapes.edge)
+    window = np.minimum(WINDOW_OF_RADIUS * rim * shapes.radius_px + WINDOW_MORE_PX, widest)
+    return fit_discs(image, place, shapes=shapes, window_px=window, opacity=opacity, iterations=iterations, rough=rough)
+
+
+def _of_starts(image: Single, starts: _Starts, dark: bool) -> Dots:
+    """Return the dots of a binned picture, in its pixels."""
+    start, spacing, good, shapes = starts.place, starts.spacing, starts.good.copy(), _first_shapes(starts)
+    opacity = FIRST_OPACITY if dark else 0.0
+    place = start
+    for rough in (True, False):
+        fits = _fitted(image, place, shapes, spacing, opacity, rough=rough)
+        looks = _looks(fits, dark)
+        near = np.linalg.norm(fits.centre_px - start, axis=1) < 0.5 * shapes.radius_px
+        place = np.where(near[:, None], fits.centre_px, start)
+        good &= near
+        if np.count_nonzero(good) < AGREEING:
+            return _none(dark=dark)
+        usual, spread = _of_neighbours(start, looks, good)
+        if dark:  # where there is least haze the contrast shows it
+            opacity = float(np.clip(np.quantile(np.exp(looks[good, 4]), 0.95), 0, 1))
+        shapes = Shapes(np.exp(usual[:, 0]), usual[:, 1:3], np.exp(usual[:, 3]))
+    kept = _alike(fits, looks, usual, spread, dark, factor=DOUBT)
+    kept &= np.linalg.norm(fits.centre_px - start, axis=1) < 0.6 * shapes.radius_px
+    kept &= _whole(fits, image.shape) & _single(fits)
+    contrast = fits.amplitude / fits.ground if dark else fits.amplitude
+    return Dots(
+        fits.centre_px[kept],
+        np.sqrt(fits.variance_px2[kept]),
+        fits.shapes.radius_px[kept],
+        np.abs(contrast[kept]),
+        spacing[kept],
+        ~_alike(fits, looks, usual, spread, dark)[kept],
+        dark,
+    )
+
+
+def _looks(fits: DiscFits, dark: bool) -> Array:
+    """Return what neighbours are compared by, (n, 6): log radius, ellipticities, log edge, log contrast, residual."""
+    contrast = np.abs(fits.amplitude) / (np.maximum(np.abs(fits.ground), 1e-12) if dark else 1.0)
+    log_contrast = np.log(np.maximum(contrast, 1e-12))
+    left = np.log(np.maximum(fits.residual, 1e-12) / np.maximum(np.abs(fits.amplitude), 1e-12))
+    shapes = fits.shapes
+    return np.column_stack([np.log(shapes.radius_px), shapes.ellipticity, np.log(shapes.edge), log_contrast, left])
+
+
+def _of_neighbours(places: Array, values: Array, good: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Return median and robust deviation (n, values) of each place's nearest good dots."""
+    count = min(NEIGHBOURS, int(np.count_nonzero(good)))
+    _, index = cKDTree(places[good]).query(places, k=np.arange(1, count + 1))
+    near = values[good][index]
+    middle = np.median(near, axis=1)
+    return middle, 1.4826 * np.median(np.abs(near - middle[:, None]), axis=1)
+
+
+def _alike(
+    fits: DiscFits, looks: Array, usual: Array, spread: Array, dark: bool, factor: float = 1.0
+) -> NDArray[np.bool_]:
+    """Return which dots look like their neighbours: limits are wide where the neighbours differ, as speckle does."""
+    least = np.array([0.25, 0.2, 0.2, 1.5, 1.0, 1.2])
+    off = np.abs(looks - usual) <= factor * np.maximum(least, 5 * spread)
+    off[:, 5] |= looks[:, 5] < usual[:, 5]  # a dot that fits better than others is welcome
+    off[:, 5] |= looks[:, 5] < np.log(0.05)
+    signed = (fits.amplitude < 0) if dark else (fits.amplitude > 0)
+    return np.asarray(off.all(axis=1) & signed & (np.sqrt(fits.variance_px2) < 0.2 * fits.shapes.radius_px))
+
+
+def _whole(fits: DiscFits, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Return which dots the picture's edge does not cut off."""
+    reach = WHOLE * fits.shapes.radius_px[:, None]
+    limit = np.array([shape[1], shape[0]]) - 0.5
+    return np.asarray(((fits.centre_px - reach > -0.5) & (fits.centre_px + reach < limit)).all(axis=1))
+
+
+def _single(fits: DiscFits) -> NDArray[np.bool_]:
+    """Return one of each group of fits that came to the same place: the surest."""
+    kept = np.ones(len(fits.centre_px), bool)
+    for i, j in cKDTree(fits.centre_px).query_pairs(float(np.median(fits.shapes.radius_px))):
+        kept[i if fits.variance_px2[i] > fits.variance_px2[j] else j] = False
+    return kept
+
+
+def _binned(image: Single, factor: int) -> Single:
+    if factor == 1:
+        return image
+    height, width = (factor * (n // factor) for n in image.shape)
+    size = (width // factor, height // factor)
+    return np.asarray(cv2.resize(image[:height, :width], size, interpolation=cv2.INTER_AREA), np.float32)
+
+
+def _none(*, dark: bool) -> Dots:
+    nothing = np.zeros(0)
+    return Dots(np.zeros((0, 2)), nothing, nothing, nothing, nothing, np.zeros(0, bool), dark)
