@@ -31,6 +31,10 @@ class Shapes:
     ellipticity: Array
     edge: Array
 
+    def some(self, chosen: NDArray[np.int64]) -> Shapes:
+        """Return the shapes of some dots."""
+        return Shapes(self.radius_px[chosen], self.ellipticity[chosen], self.edge[chosen])
+
 
 @dataclass(frozen=True)
 class DiscFits:
@@ -38,7 +42,7 @@ class DiscFits:
 
     `centre_px` (n, 2) as (x, y); `variance_px2` (n,) of the centre, mean of both axes; `shapes`; `amplitude` (n,) the
     dot's step against its ground, in the image's unit and signed; `ground` (n,); `residual` (n,) the rms of what the
-    model leaves, in the image's unit.
+    model leaves, in the image's unit; `further_px` (n,) how far one more iteration would move the centre.
     """
 
     centre_px: Array
@@ -47,6 +51,37 @@ class DiscFits:
     amplitude: Array
     ground: Array
     residual: Array
+    further_px: Array
+
+    @property
+    def misfit(self) -> Array:
+        """What the model leaves (n,), as a share of the dot's step."""
+        return self.residual / np.maximum(np.abs(self.amplitude), 1e-12)
+
+    def bettered(self, chosen: NDArray[np.int64], other: DiscFits) -> DiscFits:
+        """Return the fits with others in the place of some, where those fit better."""
+        better = other.misfit < self.misfit[chosen]
+        into = chosen[better]
+
+        def mixed(mine: Array, new: Array) -> Array:
+            out = mine.copy()
+            out[into] = new[better]
+            return out
+
+        shapes = Shapes(
+            mixed(self.shapes.radius_px, other.shapes.radius_px),
+            mixed(self.shapes.ellipticity, other.shapes.ellipticity),
+            mixed(self.shapes.edge, other.shapes.edge),
+        )
+        return DiscFits(
+            mixed(self.centre_px, other.centre_px),
+            mixed(self.variance_px2, other.variance_px2),
+            shapes,
+            mixed(self.amplitude, other.amplitude),
+            mixed(self.ground, other.ground),
+            mixed(self.residual, other.residual),
+            mixed(self.further_px, other.further_px),
+        )
 
 
 def fit_discs(
@@ -73,7 +108,7 @@ def fit_discs(
         (n,) radius of the disc of pixels that is used; it must not reach the neighbouring dots.
     opacity
         Of dark dots, the share of the ground's slope that is missing within them; haze lies over them too, so that
-        their         contrast is no measure of it. 0 for bright dots, which add to their ground.
+        their contrast is no measure of it. 0 for bright dots, which add to their ground.
     iterations
         Gauss-Newton steps.
     rough
@@ -89,15 +124,19 @@ def fit_discs(
     inside = (np.hypot(x, y) <= reach) & (not rough or (x + y) % 2 == 0)
     offsets = np.stack([x[inside], y[inside]]).astype(np.int64)
     padded = np.pad(image, reach + 2, constant_values=np.nan)
-    pieces = [slice(i, min(i + CHUNK, len(start_px))) for i in range(0, len(start_px), CHUNK)]
+    distance = np.hypot(*offsets)
+    order = np.argsort(window_px, kind="stable")  # dots of like size together: small ones need few pixels
+    pieces = [order[i : i + CHUNK] for i in range(0, len(order), CHUNK)]
 
-    def fitted(piece: slice) -> Array:
-        local = Shapes(shapes.radius_px[piece], shapes.ellipticity[piece], shapes.edge[piece])
-        return _fit_chunk(padded, reach + 2, start_px[piece], local, window_px[piece], offsets, opacity, iterations)
+    def fitted(piece: NDArray[np.int64]) -> Array:
+        local = shapes.some(piece)
+        pixels = offsets[:, distance <= window_px[piece].max()]
+        return _fit_chunk(padded, reach + 2, start_px[piece], local, window_px[piece], pixels, opacity, iterations)
 
+    table = np.zeros((len(start_px), 11))
     with ThreadPoolExecutor(THREADS) as pool:
-        rows = list(pool.map(fitted, pieces))
-    table = np.concatenate(rows) if rows else np.zeros((0, 10))
+        for piece, rows in zip(pieces, pool.map(fitted, pieces), strict=True):
+            table[piece] = rows
     return DiscFits(
         centre_px=table[:, 0:2],
         variance_px2=table[:, 2],
@@ -105,6 +144,7 @@ def fit_discs(
         amplitude=table[:, 7],
         ground=table[:, 8],
         residual=table[:, 9],
+        further_px=table[:, 10],
     )
 
 
@@ -159,14 +199,17 @@ def _fit_chunk(
             p[:, 0:2] = np.clip(p[:, 0:2], -window[:, None], window[:, None])
             p[:, 3:5] = np.clip(p[:, 3:5], -0.6, 0.6)
             p[:, 5] = np.clip(p[:, 5], np.log(SOFTEST), np.log(SHARPEST))
-    covariance = np.linalg.inv(normal) * (noise**2)[:, None, None]
-    out = np.zeros((n, 10))
+    inverse = np.linalg.inv(normal)
+    covariance = inverse * (noise**2)[:, None, None]
+    further = np.matmul(inverse[:, 0:2], right[..., None])[..., 0]
+    out = np.zeros((n, 11))
     out[:, 0:2] = p[:, 0:2] + base
     out[:, 2] = (covariance[:, 0, 0] + covariance[:, 1, 1]) / 2
     out[:, 3], out[:, 4:6], out[:, 6] = np.exp(p[:, 2]), p[:, 3:5], np.exp(p[:, 5])
     out[:, 7] = p[:, 9] * scale
     out[:, 8] = p[:, 6] * scale
     out[:, 9] = np.sqrt(np.sum(used * left**2, axis=1) / count) * scale
+    out[:, 10] = np.hypot(*further.T)
     return out
 
 

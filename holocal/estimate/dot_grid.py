@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,7 +19,7 @@ Array = NDArray[np.float64]
 LEAST_DOTS = 12
 LEAST_SIDE = 3  # rows, and columns
 MOST_DISAGREEMENT = 0.09  # of the spacing: dots thrown at random, where they fit at all, disagree by 0.1
-LEAST_SHARE = 0.25  # of the cells between the outermost that hold a dot
+LEAST_SHARE = 0.25  # of the cells within the outermost dots that hold one
 
 
 @dataclass(frozen=True)
@@ -96,13 +97,19 @@ def _check(dots: Dots, index: DotIndex) -> None:
             limit=MOST_DISAGREEMENT,
             code="no-grid",
         )
-    share = indexed / (index.rows * index.columns)
+    share = indexed / _cells_within(index)
     if share < LEAST_SHARE:
         raise RefusedError(
-            f"no grid of dots: {indexed} dots fill {share:.0%} of {index.rows} rows and {index.columns} columns; "
-            f"the limit is {LEAST_SHARE:.0%}.",
+            f"no grid of dots: {indexed} dots fill {share:.0%} of the cells that they surround; the limit is "
+            f"{LEAST_SHARE:.0%}.",
             fix=fix,
             measured=share,
             limit=LEAST_SHARE,
             code="no-grid",
         )
+
+
+def _cells_within(index: DotIndex) -> float:
+    """Return how many cells the outermost dots surround: a tilted target's cells in the picture form no rectangle."""
+    hull = cv2.convexHull(np.column_stack([index.column, index.row]).astype(np.float32))
+    return float(cv2.contourArea(hull)) + float(cv2.arcLength(hull, closed=True)) / 2 + 1

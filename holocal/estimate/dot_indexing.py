@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 
 from holocal.estimate.dot_detection import Dots
 from holocal.estimate.dot_scale import lattice_agreement
+from holocal.estimate.lattice_joining import Piece, joined_cells
 from holocal.estimate.lattice_prediction import NOISE, REACH, Canvas, Places, predict
 
 Array = NDArray[np.float64]
@@ -32,15 +33,18 @@ DOUBTFUL = 0.25
 BRIDGES = (1, 2, 3, 4)  # cells that are looked across, when nothing nearer is found
 OUTLIER_SIGMAS = 6.0
 MEDIAN_OF_RAYLEIGH = 1.1774  # of the distance of Gaussian errors along two axes, in their deviations
-OUTLIER_LEAST = 0.03  # of the spacing: nearer to its prediction no dot is an outlier
+OUTLIER_LEAST = 0.05  # of the spacing: nearer to its prediction no dot is an outlier
 CONTRAST_LEAST = 0.8  # a factor of 2.2 either way: a ghost beside clean dots is fainter
-DOUBTFUL_REACH = (0.008, 0.1)  # of the spacing
+CONTRAST_AT_ITS_PLACE = 3.0  # a factor of 20, for dots just where they should be: a shadow's edge
+DOUBTFUL_REACH = (0.03, 0.1)  # of the spacing
 COMPANIONS = 2  # indexed dots among the eight round a cell; lonely ones prove nothing
 JOINED = (0.05, 0.3)  # of the spacing: how well a step between two dots must agree with the steps known there
 JOINED_SIGMAS = 10.0
 SPARSE = 0.1  # of the next row's dots: an outer row with fewer is the picture's edge, not the grid's
 LINKS = ((0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0), (0, 3), (3, 0), (0, 4), (4, 0))
 LEAST = 9
+PIECES = 4  # more of them are looked for beside the largest
+LEAST_PIECE = 12  # dots
 
 
 @dataclass(frozen=True)
@@ -86,9 +90,38 @@ def index_dots(dots: Dots) -> DotIndex:
     best = _connected(_consistent(best, places), places)
     if np.count_nonzero(best.cell >= 0) < LEAST:
         return none
-    everything = replace(search, free=np.ones(len(dots), bool), widest=_precise(best, places))
+    everything = replace(
+        search,
+        free=np.ones(len(dots), bool),
+        widest=_precise(best, places),
+        contrast_limit=max(search.contrast_limit, CONTRAST_AT_ITS_PLACE),
+    )
     best = _connected(_consistent(_grown(best, everything), places), places)
+    best = _with_pieces(best, dots, search, everything)
     return _canonical(best, places)
+
+
+def _with_pieces(canvas: Canvas, dots: Dots, search: _Search, everything: _Search) -> Canvas:
+    """Return the canvas with the pieces that something lies in front of, as far as they certainly belong to it."""
+    left = dots.doubtful.copy()
+    for _ in range(PIECES):
+        left[canvas.cell[canvas.cell >= 0]] = True
+        if np.count_nonzero(~left) < LEAST_PIECE:
+            break
+        piece = _largest(replace(dots, doubtful=left), replace(search, free=~left))
+        if piece is None:
+            break
+        piece = _connected(_consistent(piece, search.dots), search.dots)
+        number = piece.cell[piece.cell >= 0]
+        left[number] = True
+        if len(number) < LEAST_PIECE:
+            break
+        main, other = (Piece(np.argwhere(c.cell >= 0), dots.centre_px[c.cell[c.cell >= 0]]) for c in (canvas, piece))
+        cells = joined_cells(main, other)
+        if cells is not None:
+            canvas = canvas.holding(cells, number, search.dots.centre_px)
+            canvas = _consistent(_grown(canvas, everything), search.dots)
+    return canvas
 
 
 @dataclass(frozen=True)

@@ -82,13 +82,18 @@ def candidates(response: Single, sigma_px: float, *, share: float) -> tuple[NDAr
     """
     reach = int(np.ceil(1.2 * sigma_px))
     highest = cv2.dilate(response, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))
-    side = int(16 * sigma_px) | 1
-    local = np.sqrt(np.maximum(cv2.blur(response * response, (side, side)), 0))
+    local = local_rms(response, sigma_px)
     brightest = float(np.quantile(response[:: 1 + reach // 2, :: 1 + reach // 2], 0.995))
     rows, columns = np.nonzero((response >= highest) & (response > np.maximum(share * local, FAINTEST * brightest)))
     strength = response[rows, columns]
     order = np.argsort(strength)[::-1][:MOST_CANDIDATES]
     return np.stack([columns, rows], axis=1)[order].astype(np.int64), strength[order]
+
+
+def local_rms(response: Single, sigma_px: float) -> Single:
+    """Return the rms of a filter's response in windows of 16 of its sigmas."""
+    side = int(16 * sigma_px) | 1
+    return np.asarray(np.sqrt(np.maximum(cv2.blur(response * response, (side, side)), 0)), np.float32)
 
 
 def laplacian(image: Single, sigma_px: float, *, dark: bool) -> Single:

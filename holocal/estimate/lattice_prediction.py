@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -34,7 +35,7 @@ class Canvas:
     """Cells round a seed while they are filled.
 
     `cell` (height, width) holds the index of the dot in each cell, -1 where there is none; `steps` (height, width, 2,
-    2)     the step to the next row and to the next column, (x, y) in pixels, where a cell is filled.
+    2) the step to the next row and to the next column, (x, y) in pixels, where a cell is filled.
     """
 
     cell: Integers
@@ -58,6 +59,24 @@ class Canvas:
         by = 64
         cell = np.pad(self.cell, by, constant_values=-1)
         return Canvas(cell, np.pad(self.steps, ((by, by), (by, by), (0, 0), (0, 0))))
+
+    def holding(self, cells: Integers, dots: Integers, centre_px: Array) -> Canvas:
+        """Return a canvas that holds more dots (n,) in cells (n, 2), which may lie beyond its border."""
+        margin = 2 * REACH + 2
+        before = np.maximum(margin - cells.min(axis=0), 0)
+        after = np.maximum(cells.max(axis=0) + margin + 1 - self.cell.shape, 0)
+        by = tuple(zip(before.tolist(), after.tolist(), strict=True))
+        cell = np.pad(self.cell, by, constant_values=-1)
+        steps = np.pad(self.steps, (*by, (0, 0), (0, 0)))
+        rows, columns = (cells + before).T
+        cell[rows, columns] = dots
+        # The plane through the nearest of them: to the next row and the next column.
+        _, near = cKDTree(centre_px[dots]).query(centre_px[dots], k=min(9, len(dots)))
+        offset = (cells[near] - cells[near].mean(axis=1, keepdims=True)).astype(np.float64)
+        place = centre_px[dots][near]
+        normal = offset.transpose(0, 2, 1) @ offset + 1e-9 * np.eye(2)
+        steps[rows, columns] = np.linalg.solve(normal, offset.transpose(0, 2, 1) @ place)
+        return Canvas(cell, steps)
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,10 @@ class Target:
     dark_quadrant: float = 1.0  # light in one quadrant
     vignetting: float = 0.0
     stains: int = 0
+    sizes: float = 0.0  # standard deviation of the dots' log radius
+    marked: tuple[tuple[int, int], ...] = ()  # (column, row) of dots 1.6 times as large
+    shadow: float = 12.0  # pixels over which the quadrant's light falls off
+    ruler: float = 0.0  # height in spacings of a bar across the picture, below the middle
     seed: int = 0
 
     def but(self, **changes) -> Target:
@@ -75,15 +79,26 @@ def picture(target: Target) -> Seen:
     inside = (np.abs(centre - half + 0.5) < half + radius[:, None] + 1).all(axis=1) & (area > 0.15)
     inside &= _unfolded(target, lattice)
     centre, row, column, radius = centre[inside], row[inside], column[inside], radius[inside]
+    if target.sizes:
+        radius = radius * np.exp(rng.normal(0, target.sizes, len(radius)))
+    for c, r in target.marked:
+        radius[(column == c) & (row == r)] *= 1.6
     shown = rng.random(len(centre)) >= target.missing
+    if target.ruler:
+        top, bottom = bar(target)
+        shown &= (centre[:, 1] + radius < top - 2) | (centre[:, 1] - radius > bottom + 2)
     cover = coverage(target.width, target.height, centre[shown], radius[shown])
     if target.blur:
         cover = cv2.GaussianBlur(cover, (0, 0), target.blur)
     y, x = np.mgrid[: target.height, : target.width]
     light = 1 - target.vignetting * (((x - half[0]) ** 2 + (y - half[1]) ** 2) / (half**2).sum())
-    soft = 1 / (1 + np.exp(-(x - half[0]) / 12)) / (1 + np.exp(-(y - half[1]) / 12))
+    across, down = (np.clip(at / target.shadow, -30, 30) for at in (x - half[0], y - half[1]))
+    soft = 1 / (1 + np.exp(-across)) / (1 + np.exp(-down))
     light = light * (1 - (1 - target.dark_quadrant) * soft)
     image = light * ((1 - target.contrast * cover) if target.dark else (1 - target.contrast + target.contrast * cover))
+    if target.ruler:
+        image[top:bottom] = 0.6
+        image[top : (top + bottom) // 2, :: max(4, round(target.spacing / 3))] = 0.05
     for _ in range(target.stains):
         at, size = rng.uniform([0, 0], 2 * half), rng.uniform(0.3, 1.2) * target.spacing
         image = image * (1 - rng.uniform(0.2, 0.6) * np.exp(-0.5 * ((x - at[0]) ** 2 + (y - at[1]) ** 2) / size**2))
@@ -91,6 +106,12 @@ def picture(target: Target) -> Seen:
     image = np.clip(np.round(image * 255), 0, 255) / 255
     whole = (centre - radius[:, None] > 1).all(axis=1) & (centre + radius[:, None] < 2 * half - 2).all(axis=1)
     return Seen(image.astype(np.float32), centre[whole], row[whole], column[whole], shown[whole])
+
+
+def bar(target: Target) -> tuple[int, int]:
+    """Return the first row of the ruler and the first below it."""
+    top = round(0.6 * target.height)
+    return top, top + round(target.ruler * target.spacing)
 
 
 def _unfolded(target: Target, lattice: np.ndarray) -> np.ndarray:

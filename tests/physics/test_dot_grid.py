@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from dot_pictures import Seen, Target, picture, spots
+from dot_pictures import Seen, Target, bar, picture, spots
 from scipy.spatial import cKDTree
 
 from holocal.errors import RefusedError
@@ -52,6 +52,10 @@ CASES = {
     "large dots": PLAIN.but(spacing=70, radius=20, k1=-0.1),
     "fat dots": PLAIN.but(radius=9),
     "thin dots": PLAIN.but(spacing=50, radius=4.5),
+    "strong perspective": PLAIN.but(perspective=(0.45, 0.2), spacing=26, radius=6.5),
+    "dots of different sizes": PLAIN.but(sizes=0.18, seed=2),
+    "a marker of larger dots": PLAIN.but(marked=((0, 0), (1, 0), (0, 2)), rotation=5),
+    "a ruler across": PLAIN.but(ruler=2.5, spacing=20, radius=5, rotation=3, k1=-0.1),
 }
 
 
@@ -208,6 +212,35 @@ def test_a_picture_without_a_grid_is_refused(make, seed):
         detect_grid(np.clip(make(seed), 0, 1).astype(np.float32))
     assert refused.value.exit_status == 4
     assert refused.value.code == "no-grid"
+
+
+def test_a_sharp_shadow_ends_no_lattice_of_bright_dots():
+    target = PLAIN.but(dark=False, dark_quadrant=0.1, shadow=1.0, noise=0.005)
+    seen = picture(target)
+    off = np.abs(seen.centre + 0.5 - [target.width / 2, target.height / 2]).min(axis=1)
+    seen.shown[off < target.radius + 2] = False  # the shadow's edge moves the dots that it cuts
+    distance, share = matched(seen, detect_grid(seen.image))
+    assert distance.max() < 0.3 * target.spacing
+    assert share > 0.98
+
+
+def test_larger_dots_of_a_marker_are_as_precise_as_others():
+    target = PLAIN.but(marked=((0, 0), (1, 0), (0, 2)), rotation=5)
+    seen = picture(target)
+    grid = detect_grid(seen.image)
+    for cell in target.marked:
+        at = seen.centre[(seen.column == cell[0]) & (seen.row == cell[1])][0]
+        assert np.linalg.norm(grid.centre_px - at, axis=1).min() < 0.05
+
+
+def test_pieces_beside_a_ruler_that_do_not_fit_are_not_joined():
+    target = PLAIN.but(ruler=2.5, spacing=20, radius=5)
+    image = picture(target).image
+    _, bottom = bar(target)
+    torn = image.copy()
+    torn[bottom:] = np.roll(image, 8, axis=1)[bottom:]  # by 0.4 of the spacing
+    for whole, joined in ((image, True), (torn, False)):
+        assert (detect_grid(whole).centre_px[:, 1].max() > bottom) == joined
 
 
 def test_two_lattices_that_do_not_fit_are_not_joined():
