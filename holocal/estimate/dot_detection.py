@@ -6,6 +6,7 @@ second expects of it, so that perspective and blur may change over the picture w
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import cv2
@@ -87,7 +88,9 @@ def find_dots(image: Single) -> Dots:
     Dots that the picture's edge cuts off, and spots unlike those around them in size, form or contrast, are left out.
     """
     picture = np.ascontiguousarray(image, np.float32)
-    seen = [look for scale in dot_scales(picture) if (look := _look(picture, scale)) is not None]
+    with ThreadPoolExecutor(2) as pool:  # one for dark dots, one for bright ones
+        looks = list(pool.map(lambda scale: _look(picture, scale), dot_scales(picture)))
+    seen = [look for look in looks if look is not None]
     if not seen:
         return _none(dark=True)
     best = min(seen, key=lambda look: look.misfit)  # gaps between fat dots form a lattice too, but are no discs
@@ -179,7 +182,7 @@ def _of_sizes(image: Single, sigma: float, dark: bool) -> _Starts | None:
         down, up = count[0] >= AGREEING and sigmas[0] > SMALLEST_SIGMA_PX, count[1] >= AGREEING
         if not down and not up:
             break
-        smaller, larger = smaller + down, larger + up
+        smaller, larger = smaller + int(down), larger + int(up)
     return starts
 
 
