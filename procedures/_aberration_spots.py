@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -73,7 +74,12 @@ class SpotArray:
     bend_per_m: Array
     amplitude: Array
     pixels: Array
-    nearby: Nearby
+
+    @cached_property
+    def nearby(self) -> Nearby:
+        """How directions near the spots' own differ from them."""
+        radius_m = self.facts.pupil_diameter_m / 2
+        return _nearby(nominal_bench(self.facts), self.waves, self.field_tan, self.wavelength_m, radius_m)
 
     @property
     def panel(self) -> Panel:
@@ -126,17 +132,21 @@ def spot_array(facts: RigFacts, wavelength_m: float, zones: int) -> SpotArray:
     """Return zones x zones spots over the camera's field, made for a rig's nominal bench; the last two are kept."""
     key = repr((facts, wavelength_m, zones))
     if key not in _MADE:
-        _MADE[key] = _spot_array(facts, wavelength_m, zones)
+        _MADE[key] = spots_at(facts, wavelength_m, zone_directions(zones, facts.camera.field_rad))
         while len(_MADE) > _KEPT:
             _MADE.popitem(last=False)
     return _MADE[key]
 
 
-def _spot_array(facts: RigFacts, wavelength_m: float, zones: int) -> SpotArray:
-    camera = facts.camera
+def nominal_bench(facts: RigFacts) -> Bench:
+    """Return the bench that a rig's drawing says."""
+    return Bench.nominal(pupil_diameter_m=facts.pupil_diameter_m, eye_relief_m=facts.eye_relief_m)
+
+
+def spots_at(facts: RigFacts, wavelength_m: float, field_tan: Array) -> SpotArray:
+    """Return spots in directions with tangents (n, 2), made for a rig's nominal bench."""
+    camera, bench = facts.camera, nominal_bench(facts)
     panel = Panel(facts.slm.width, facts.slm.height, facts.slm.pitch_m)
-    bench = Bench.nominal(pupil_diameter_m=facts.pupil_diameter_m, eye_relief_m=facts.eye_relief_m)
-    field_tan = zone_directions(zones, camera.field_rad)
     waves = spot_waves(bench, panel, VirtualPoints.at(field_tan), wavelength_m=wavelength_m)
     x, y = waves.block_grid(_BLOCK)
     pupil = waves.pupil.on_grid(x, y)
@@ -167,9 +177,8 @@ def _spot_array(facts: RigFacts, wavelength_m: float, zones: int) -> SpotArray:
     if on.any():
         amplitude = np.minimum(amplitude / amplitude[on].min(), MOST_BOOST)
     return SpotArray(
-        facts, wavelength_m, field_tan, waves, lit, centre, half, flux, bend, np.asarray(amplitude), pixels,
-        _nearby(bench, waves, field_tan, wavelength_m, facts.pupil_diameter_m / 2),
-    )  # fmt: skip
+        facts, wavelength_m, field_tan, waves, lit, centre, half, flux, bend, np.asarray(amplitude), pixels
+    )
 
 
 def _nearby(bench: Bench, waves: SpotWaves, field_tan: Array, wavelength_m: float, radius_m: float) -> Nearby:
@@ -238,19 +247,25 @@ def added_phase(array: SpotArray, recipe: Recipe, pupil_m: Array) -> Array:
     return np.asarray(phase)
 
 
-def recipe_levels(array: SpotArray, recipe: Recipe, response_rad: Array, device: str = "cpu") -> Levels:
-    """Return the levels that show a recipe: the phase of the sum of its waves, to the nearest level."""
+def recipe_levels(
+    array: SpotArray, recipe: Recipe, response_rad: Array, device: str = "cpu", *, only_pupil: bool = False
+) -> Levels:
+    """Return the levels that show a recipe: the phase of the sum of its waves, to the nearest level.
+
+    The waves reach beyond the nominal pupil, so that they fill a bench's own wherever it lies; with `only_pupil` they
+    end at its rim, as an image's do.
+    """
     from holocal.hologram.frame import phase_to_levels
 
     waves = array.waves.with_phase(lambda q: added_phase(array, recipe, q))
     amplitude = array.amplitude * recipe.gain * np.exp(1j * recipe.phase_rad)
     radius = array.facts.pupil_diameter_m / 2
-    window_m = radius + REACH_M - 1.7e-3
+    window_m, soft_m = (radius, EDGE_M) if only_pupil else (radius + REACH_M - 1.7e-3, SOFT_M)
 
     def window(pupil_m: Array) -> Array:
-        return soft_disc(pupil_m, window_m, SOFT_M)
+        return soft_disc(pupil_m, window_m, soft_m)
 
-    shown = synthesise(waves, amplitude, window, reach_m=window_m + SOFT_M / 2, device=device)
+    shown = synthesise(waves, amplitude, window, reach_m=window_m + soft_m / 2, device=device)
     carrier = 2 * np.pi * np.mod(array.panel.illumination_frequency_per_m[1] * array.panel.y_m, 1.0)
     phase = torch.angle(shown).cpu().numpy() - carrier[:, None].astype(np.float32)
     count = len(response_rad)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -108,14 +108,7 @@ def residuals_rad(
     light: what passes the true pupil of what a hologram of the nominal bench sends.
     """
     bench = true_bench(nominal, truth)
-    flatness = truth.get("slm", {}).get("flatness_nm") or []
-    half = np.asarray(panel.half_size_m)
-    line = [(np.arange(n) + 0.5) / n * 2 - 1 for n in GRID]
-    x = np.stack(np.meshgrid(line[0] * half[0], line[1] * half[1]), axis=-1).reshape(-1, 2)
-    own = np.zeros(len(x))
-    for index, rms_nm in flatness:
-        local = x / np.hypot(*half)
-        own += 2 * np.pi / wavelength_m * rms_nm * 1e-9 * zernike([index], local[:, 0], local[:, 1])[0]
+    x, own = panel_points(panel, truth, wavelength_m)
     sets = int(np.prod(coefficients_rad.shape[:-2]))
     estimates = coefficients_rad.reshape(sets, *coefficients_rad.shape[-2:])
     left = each(
@@ -125,37 +118,75 @@ def residuals_rad(
     return np.stack(left, axis=-1).reshape(coefficients_rad.shape[:-1])
 
 
-def _zone(
-    nominal: Bench, bench: Bench, x: Array, own: Array, tangent: Array, wavelength_m: float, noll: Sequence[int],
-    coefficients_rad: Array,
-) -> Array:  # fmt: skip
+@dataclass(frozen=True)
+class Light:
+    """A spot's light on a true bench, at n points of the panel.
+
+    `seen` (2,) tangents that it is seen along: no tilt is left; `error_rad` (n,) phase there; `nominal_m`, `pupil_m`
+    (n, 2) where it crosses the nominal and the true pupil's plane; `amount` (n,) of light that passes.
+    """
+
+    seen: Array
+    error_rad: Array
+    nominal_m: Array
+    pupil_m: Array
+    amount: Array
+
+
+def light_of_spot(
+    nominal: Bench, bench: Bench, x: Array, own: Array, tangent: Array, wavelength_m: float
+) -> Light | None:
+    """Return where a spot sent along a tangent (2,) is seen; `own` (n,) is the panel's path. None for a dark one."""
     k, radius = 2 * np.pi / wavelength_m, nominal.pupil_diameter_m / 2
     there = exact_phase(nominal, VirtualPoints.at(tangent), x, wavelength_m=wavelength_m)
-    local = there.pupil_m / radius
-    estimates = np.zeros((len(coefficients_rad), len(x)))
-    if len(noll):
-        estimates = coefficients_rad @ zernike(noll, local[:, 0], local[:, 1])
-    dark = np.full(len(coefficients_rad), np.nan)
     sent = soft_disc(there.pupil_m, radius, EDGE_M)
     seen = np.array(tangent, np.float64)
     for _ in range(ROUNDS):
         real = exact_phase(bench, VirtualPoints.at(seen), x, wavelength_m=wavelength_m)
         lit = (real.error_m < 1e-9) & (there.error_m < 1e-9)
-        amount = np.where(lit, (soft_disc(np.nan_to_num(real.pupil_m), radius, EDGE_M) * sent) ** 2, 0.0)
-        amount = amount * np.where(lit, _area(np.nan_to_num(real.pupil_m)), 0.0)
+        pupil_m = np.nan_to_num(real.pupil_m)
+        amount = np.where(lit, (soft_disc(pupil_m, radius, EDGE_M) * sent) ** 2, 0.0) * np.where(lit, _area(pupil_m), 0)
         search = amount if amount.sum() > 0 else np.where(lit, sent**2, 0.0)
         if np.count_nonzero(search) < 6:
-            return dark
+            return None
         error = np.nan_to_num(there.phase_rad - real.phase_rad) + own
-        slope, _ = _without_plane(error, np.nan_to_num(real.pupil_m), search)
+        slope, _ = _without_plane(error, pupil_m, search)
+        last = seen
         sines = seen / np.sqrt(1 + seen @ seen) - slope / k
         if not sines @ sines < 1:  # the light is seen along no direction at all
-            return dark
+            return None
         seen = sines / np.sqrt(1 - sines @ sines)
     if np.count_nonzero(amount) < 6:
-        return dark
-    rests = [_without_plane(error - estimated, np.nan_to_num(there.pupil_m), amount)[1] for estimated in estimates]
+        return None
+    return Light(last, error, np.nan_to_num(there.pupil_m), pupil_m, amount)
+
+
+def _zone(
+    nominal: Bench, bench: Bench, x: Array, own: Array, tangent: Array, wavelength_m: float, noll: Sequence[int],
+    coefficients_rad: Array,
+) -> Array:  # fmt: skip
+    light = light_of_spot(nominal, bench, x, own, tangent, wavelength_m)
+    if light is None:
+        return np.full(len(coefficients_rad), np.nan)
+    estimates = np.zeros((len(coefficients_rad), len(x)))
+    if len(noll):
+        local = light.nominal_m / (nominal.pupil_diameter_m / 2)
+        estimates = coefficients_rad @ zernike(noll, local[:, 0], local[:, 1])
+    amount = light.amount
+    rests = [_without_plane(light.error_rad - estimated, light.nominal_m, amount)[1] for estimated in estimates]
     return np.array([np.sqrt(np.sum(amount * rest**2) / amount.sum()) for rest in rests])
+
+
+def panel_points(panel: Panel, truth: Mapping[str, Any], wavelength_m: float) -> tuple[Array, Array]:
+    """Return an even grid of points of the panel (n, 2), and the phase of its own path there (n,)."""
+    half = np.asarray(panel.half_size_m)
+    line = [(np.arange(n) + 0.5) / n * 2 - 1 for n in GRID]
+    x = np.stack(np.meshgrid(line[0] * half[0], line[1] * half[1]), axis=-1).reshape(-1, 2)
+    own = np.zeros(len(x))
+    for index, rms_nm in truth.get("slm", {}).get("flatness_nm") or []:
+        local = x / np.hypot(*half)
+        own += 2 * np.pi / wavelength_m * rms_nm * 1e-9 * zernike([index], local[:, 0], local[:, 1])[0]
+    return x, own
 
 
 def _without_plane(values: Array, pupil_m: Array, weight: Array) -> tuple[Array, Array]:

@@ -24,7 +24,9 @@ class CameraFacts:
     """A camera where the eye would be.
 
     `field_rad` is its full nominal field (width, height). The picture is rectilinear: pixel j of n of the width looks
-    along x/z = tan(field_rad / 2) * (2 j + 1 - n) / n; row 0 is the top (largest y).
+    along x/z = tan(field_rad / 2) * (2 j + 1 - n) / n; row 0 is the top (largest y). That is before the camera's own
+    geometry, as its calibration says it: turned by `rotation_rad` (positive from +x towards +y), what lies at the
+    tangent r is seen at r (1 + k1 r^2 + k2 r^4).
     """
 
     width: int
@@ -37,6 +39,9 @@ class CameraFacts:
     vendor: str = ""
     model: str = ""
     serial: str = ""
+    rotation_rad: float = 0.0
+    k1: float = 0.0
+    k2: float = 0.0
 
 
 @dataclass(frozen=True)

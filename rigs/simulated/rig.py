@@ -188,6 +188,9 @@ class SimulatedRig:
             "holocal",
             "simulated camera",
             "C0",
+            lens.rotation_rad,
+            lens.k1,
+            lens.k2,
         )
         wavelengths = tuple(line * NM for line in optics.wavelengths_nm)
         self._tables = tables

@@ -1,0 +1,98 @@
+"""Where a simulated bench's rays are seen, against where the verification's spots were to be seen."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from holocal.loop.procedure import Conclusion
+from holocal.optics.bench import Bench, Panel
+from holocal.optics.phase_function import VirtualPoints, exact_phase
+from holocal.threads import each
+from procedures._aberration_truth import GRID, Light, light_of_spot, panel_points, true_bench
+
+Array = NDArray[np.float64]
+
+DEGREE = 5  # of the polynomial whose slope over the pupil is a spot's middle
+
+
+def against_truth(done: Conclusion, truth: Mapping[str, Any]) -> dict[str, Any]:
+    """Return `residual_px` and `before_px` (rms, max) of the verification's directions by exact rays, free of noise."""
+    facts, checked = done.extra["rig_facts"], done.extra["checked"]
+    sent, wanted = np.array(checked["sent_tan"]).reshape(-1, 2), np.array(checked["wanted_tan"]).reshape(-1, 2)
+    diameter = (truth.get("camera") or {}).get("pupil_mm")
+    nominal = Bench.nominal(
+        pupil_diameter_m=facts["pupil_diameter_m"] if diameter is None else 1e-3 * diameter,
+        eye_relief_m=facts["eye_relief_m"],
+    )
+    panel = Panel(int(facts["panel_width"]), int(facts["panel_height"]), facts["pitch_m"])
+    wavelength_m = 1e-9 * float(facts["wavelength_nm"])
+    bench = true_bench(nominal, truth)
+    x, own = panel_points(panel, truth, wavelength_m)
+
+    beam = illumination(x, truth)
+
+    def seen(tangent: Array) -> Array:
+        light = light_of_spot(nominal, bench, x, own, tangent, wavelength_m)
+        if light is None:
+            return np.full(2, np.nan)
+        sent = pixel_light(nominal, panel, x, tangent, wavelength_m)
+        return middle(replace(light, amount=light.amount * beam * sent), wavelength_m)
+
+    after = np.stack(each(lambda k: seen(sent[k]), len(sent))) - wanted
+    before = np.stack(each(lambda k: seen(wanted[k]), len(wanted))) - wanted
+    return {
+        "residual_px": _summary(after / facts["pixel_tan"]),
+        "before_px": _summary(before / facts["pixel_tan"]),
+    }
+
+
+def illumination(x: Array, truth: Mapping[str, Any]) -> Array:
+    """Return the beam's intensity at points of the panel (n, 2), (n,), 1 in the middle."""
+    beam = truth.get("illumination") or {}
+    if beam.get("profile") != "gaussian":
+        return np.ones(len(x))
+    return np.asarray(np.exp(-2 * np.sum(x**2, axis=1) / (1e-3 * float(beam["waist_mm"])) ** 2))
+
+
+def pixel_light(nominal: Bench, panel: Panel, x: Array, tangent: Array, wavelength_m: float) -> Array:
+    """Return what the pixels' areas send of a spot's light at an even grid of points (n, 2), (n,): sinc squared."""
+    turns = exact_phase(nominal, VirtualPoints.at(tangent), x, wavelength_m=wavelength_m).phase_rad / (2 * np.pi)
+    grid, at = turns.reshape(GRID[1], GRID[0]), x.reshape(GRID[1], GRID[0], 2)
+    slopes = np.gradient(grid, at[0, :, 0], axis=1), np.gradient(grid, at[:, 0, 1], axis=0)
+    made = np.ones_like(grid)
+    for slope, own in zip(slopes, panel.illumination_frequency_per_m, strict=True):
+        made *= np.sinc((slope - own) * panel.pitch_m) ** 2
+    return np.asarray(made.ravel())
+
+
+def middle(light: Light, wavelength_m: float) -> Array:
+    """Return the tangents (2,) of the middle of a spot's light: of its rays' directions, each as bright as it is."""
+    scale = 1e3
+    q = light.pupil_m * scale
+    root = np.sqrt(light.amount / light.amount.sum())
+    powers = [(i, n - i) for n in range(DEGREE + 1) for i in range(n + 1)]
+    terms = np.stack([q[:, 0] ** i * q[:, 1] ** j for i, j in powers], axis=-1)
+    found = np.linalg.lstsq(terms * root[:, None], light.error_rad * root, rcond=None)[0]
+    slope = [
+        sum(
+            c * (i, j)[axis] * q[:, 0] ** max(i - (axis == 0), 0) * q[:, 1] ** max(j - (axis == 1), 0)
+            for c, (i, j) in zip(found, powers, strict=True)
+        )
+        for axis in (0, 1)
+    ]
+    mean = scale * np.array([float(np.sum(root**2 * one)) for one in slope])
+    sines = light.seen / np.sqrt(1 + light.seen @ light.seen) - mean * wavelength_m / (2 * np.pi)
+    return np.asarray(sines / np.sqrt(1 - sines @ sines))
+
+
+def _summary(off_px: Array) -> dict[str, Any]:
+    distance = np.linalg.norm(off_px, axis=1)
+    distance = distance[np.isfinite(distance)]
+    if not len(distance):
+        return {"rms": None, "max": None, "points": 0}
+    return {"rms": float(np.sqrt(np.mean(distance**2))), "max": float(distance.max()), "points": len(distance)}
