@@ -19,14 +19,15 @@ from procedures._aberration_spots import EDGE_M, Recipe, SpotArray, soft_disc
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-SPREAD = 0.45  # of the defocus that `spot_array` gives a spot: 9 pixels wide, whatever its pupil
+SPREAD = 0.3  # of the defocus that `spot_array` gives a spot: 6 pixels wide, whatever its pupil
 COARSE = 32  # pixels of the panel: how finely the light's shares are foreseen
 PEAK_OVER_MEAN = 2.2  # of a defocused spot
 ROUNDS, MOST_BOOST = 5, 4.0  # of the sharing of brightness; amplitude over the median spot's
 COHERENT = 0.78  # pi / 4: what the phase of a sum of many waves keeps of each, of its share of the light
-MARGIN_PX = 6  # of a window round a spot
+MARGIN_PX = 4  # of a window round a spot: what an aberration of 2 rad throws out; more lets in other light
 SIGMA_PX = 4.0
-FAINTEST_SIGMAS, FAINTEST_SHARE = 12.0, 0.01  # of a spot's light: over its noise, and of the median spot's
+FAINTEST_SIGMAS, FAINTEST_SHARE = 8.0, 0.01  # of a spot's light: over its noise, and of the median spot's
+WORST_PX = 0.2  # of a centroid's error: above, the spot is not seen
 CROSSTALK_PX = 0.03  # of a centroid: what the encoding leaves of the other spots' light in a window
 LARGEST_SPLIT_PX = 25.0  # between the two defoci of a spot
 
@@ -178,12 +179,13 @@ def _centroids(picture: Array, near: Array, reach: Array, noise: tuple[float, fl
                 break
             dx, dy = float((signal * x).sum() / total), float((signal * y).sum() / total)
             out[i] = column + dx, row + dy
-            variance = noise[0] + noise[1] * np.maximum(cut, 0.0)
+            # what the encoding leaves of other spots' light is seen round the spot, and lies under it too
+            variance = noise[0] + noise[1] * np.maximum(cut, 0.0) + float(np.var(cut[rim]))
             spread = variance * ((x - dx) ** 2 + (y - dy) ** 2) / 2
             sigma[i] = np.sqrt(float(spread[~rim].sum())) / total
             light[i], doubt[i] = total, np.sqrt(float(variance[~rim].sum()))
     typical = float(np.median(light[light > 0])) if np.any(light > 0) else 0.0
-    sure = (light > FAINTEST_SIGMAS * doubt) & (light > FAINTEST_SHARE * typical)
+    sure = (light > FAINTEST_SIGMAS * doubt) & (light > FAINTEST_SHARE * typical) & (sigma <= WORST_PX)
     return out, sigma, sure
 
 

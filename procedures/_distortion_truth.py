@@ -17,7 +17,7 @@ from procedures._aberration_truth import GRID, Light, light_of_spot, panel_point
 
 Array = NDArray[np.float64]
 
-DEGREE = 5  # of the polynomial whose slope over the pupil is a spot's middle
+LEAST_LIT = 0.004  # of the pupil: a spot with less is dark
 
 
 def against_truth(done: Conclusion, truth: Mapping[str, Any]) -> dict[str, Any]:
@@ -35,10 +35,11 @@ def against_truth(done: Conclusion, truth: Mapping[str, Any]) -> dict[str, Any]:
     x, own = panel_points(panel, truth, wavelength_m)
 
     beam = illumination(x, truth)
+    pupil_area = np.pi * (nominal.pupil_diameter_m / 2) ** 2
 
     def seen(tangent: Array) -> Array:
         light = light_of_spot(nominal, bench, x, own, tangent, wavelength_m)
-        if light is None:
+        if light is None or light.amount.sum() < LEAST_LIT * pupil_area:
             return np.full(2, np.nan)
         sent = pixel_light(nominal, panel, x, tangent, wavelength_m)
         return middle(replace(light, amount=light.amount * beam * sent), wavelength_m)
@@ -65,27 +66,20 @@ def pixel_light(nominal: Bench, panel: Panel, x: Array, tangent: Array, waveleng
     grid, at = turns.reshape(GRID[1], GRID[0]), x.reshape(GRID[1], GRID[0], 2)
     slopes = np.gradient(grid, at[0, :, 0], axis=1), np.gradient(grid, at[:, 0, 1], axis=0)
     made = np.ones_like(grid)
-    for slope, own in zip(slopes, panel.illumination_frequency_per_m, strict=True):
+    for slope, own in zip((np.asarray(one) for one in slopes), panel.illumination_frequency_per_m, strict=True):
         made *= np.sinc((slope - own) * panel.pitch_m) ** 2
     return np.asarray(made.ravel())
 
 
 def middle(light: Light, wavelength_m: float) -> Array:
     """Return the tangents (2,) of the middle of a spot's light: of its rays' directions, each as bright as it is."""
-    scale = 1e3
-    q = light.pupil_m * scale
-    root = np.sqrt(light.amount / light.amount.sum())
-    powers = [(i, n - i) for n in range(DEGREE + 1) for i in range(n + 1)]
-    terms = np.stack([q[:, 0] ** i * q[:, 1] ** j for i, j in powers], axis=-1)
-    found = np.linalg.lstsq(terms * root[:, None], light.error_rad * root, rcond=None)[0]
-    slope = [
-        sum(
-            c * (i, j)[axis] * q[:, 0] ** max(i - (axis == 0), 0) * q[:, 1] ** max(j - (axis == 1), 0)
-            for c, (i, j) in zip(found, powers, strict=True)
-        )
-        for axis in (0, 1)
-    ]
-    mean = scale * np.array([float(np.sum(root**2 * one)) for one in slope])
+    weight = light.amount / light.amount.sum()
+    error, pupil = light.error_rad.reshape(GRID[1], GRID[0]), light.pupil_m.reshape(GRID[1], GRID[0], 2)
+    by_panel = np.stack([np.asarray(np.gradient(error, axis=axis)).ravel() for axis in (0, 1)], axis=-1)
+    moved = np.stack([np.asarray(np.gradient(pupil, axis=axis)).reshape(-1, 2) for axis in (0, 1)], axis=1)
+    inside = (weight > 0) & (np.abs(np.linalg.det(moved)) > 0)
+    slope = np.linalg.solve(moved[inside], by_panel[inside][..., None])[..., 0]
+    mean = np.asarray(weight[inside] @ slope / weight[inside].sum())
     sines = light.seen / np.sqrt(1 + light.seen @ light.seen) - mean * wavelength_m / (2 * np.pi)
     return np.asarray(sines / np.sqrt(1 - sines @ sines))
 

@@ -1,6 +1,6 @@
 """Distortion: where the picture is seen against where it was sent, and the map that sends it where it is to be seen.
 
-Spots at known field angles are shown in pairs of opposite defocus, so that each is 9 pixels wide and its middle is
+Spots at known field angles are shown in pairs of opposite defocus, so that each is 6 pixels wide and its middle is
 where it is in focus; one coherent spot has no speckle. Two irregular grids make the map (`mode` grid: a homography,
 polynomials and a spline as far as held-out spots want them; `mode` corners: the thesis's homography of the four
 outermost spots), a third, sent through the inverse map, verifies it.

@@ -11,6 +11,7 @@ from typing import Any, Protocol
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import RectBivariateSpline
 
 from holocal.errors import InputError
 from holocal.estimate.map_basis import apply_homography
@@ -86,19 +87,19 @@ def as_remap(seen_px: Array, shape: tuple[int, int], camera_shape: tuple[int, in
     """Return `predistort`'s arrays for an image of `shape` (rows, columns) from a map over a grid.
 
     `seen_px` (h, w, 2) is where the points sent from the centres of h x w equal parts of the field are seen, in ideal
-    pixels of a camera of `camera_shape` (rows, columns); between them it is bicubic.
+    pixels of a camera of `camera_shape` (rows, columns).
     """
     sizes = [n / m for n, m in zip(shape[::-1], camera_shape[::-1], strict=True)]
-    made = []
-    for axis in (0, 1):
-        in_image = ((seen_px[..., axis] + 0.5) * sizes[axis] - 0.5).astype(np.float32)
-        made.append(_enlarged(in_image, shape))
-    return made[0], made[1]
+    columns, rows = (_enlarged((seen_px[..., axis] + 0.5) * sizes[axis] - 0.5, shape) for axis in (0, 1))
+    return columns, rows
 
 
-def _enlarged(values: NDArray[np.float32], shape: tuple[int, int]) -> NDArray[np.float32]:
-    """Return values at the centres of a finer grid; beyond the outermost centres they go on straight."""
+def _enlarged(values: Array, shape: tuple[int, int]) -> NDArray[np.float32]:
+    """Return values at the centres of a finer grid, by cubic splines; beyond the outermost centres they go on straight.
+
+    (cv2.remap reads between pixels in steps of 1/32: too coarse for a map.)
+    """
     padded = np.pad(values, 2, mode="reflect", reflect_type="odd")
-    rows, columns = ((np.arange(n) + 0.5) / n * m + 1.5 for n, m in zip(shape, values.shape, strict=True))
-    at = np.meshgrid(columns.astype(np.float32), rows.astype(np.float32))
-    return np.asarray(cv2.remap(padded, at[0], at[1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), np.float32)
+    own = [np.arange(n) for n in padded.shape]
+    at = [(np.arange(n) + 0.5) / n * m + 1.5 for n, m in zip(shape, values.shape, strict=True)]
+    return np.asarray(RectBivariateSpline(*own, padded)(*at), np.float32)

@@ -17,7 +17,7 @@ from holocal.errors import RefusedError
 from holocal.optics.bench import Array
 
 FURTHEST = 0.3  # of the picture's size that it may be shifted
-MARGIN = 1.15  # by which the best place must beat every other
+MARGIN = 1.1  # by which the best place must beat every other
 BINNED = 2  # pixels each way taken together: the places are refined afterwards
 ORIENTATIONS = (
     "upright", "turned by 90 degrees", "turned by 180 degrees", "turned by 270 degrees",
