@@ -20,6 +20,7 @@ from procedures._aberration_spots import EDGE_M, soft_disc
 Array = NDArray[np.float64]
 
 GRID = (41, 25)  # points of the panel
+SETTLED = 1e-8  # of a direction, radians; a camera pixel is 6e-4
 ROUNDS = 8  # of the search for the direction that the spot is seen along
 
 
@@ -152,6 +153,8 @@ def light_of_spot(
         error = np.nan_to_num(there.phase_rad - real.phase_rad) + own
         slope, _ = _without_plane(error, pupil_m, search)
         last = seen
+        if np.linalg.norm(slope) < SETTLED * k:
+            break
         sines = seen / np.sqrt(1 + seen @ seen) - slope / k
         if not sines @ sines < 1:  # the light is seen along no direction at all
             return None
