@@ -21,7 +21,6 @@ from procedures._distortion_points import (
     Places,
     evenly_bright,
     in_the_picture,
-    only,
     peaks_foreseen,
     places_of_pair,
     recipe,
@@ -165,16 +164,3 @@ def with_map(state: State) -> State:
         rms_px=float(np.sqrt(np.mean(off**2))),
         noise_px=float(np.median(places.sigma_px[places.found])),
     )
-
-
-__all__ = [
-    "array_of",
-    "corners_of",
-    "first_guess_s",
-    "levels_of",
-    "map_of",
-    "measured",
-    "only",
-    "with_first",
-    "with_map",
-]

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from holocal.estimate.camera_lens import ideal_pixels, pixel_tan, seen_pixels, seen_tangents
+from holocal.estimate.camera_lens import ideal_pixels, seen_pixels, seen_tangents
 from holocal.estimate.spot_pattern import recognise, require_recognised
 from holocal.estimate.spot_places import find_spots
 from holocal.loop.reference import Reference
@@ -194,20 +194,3 @@ def in_the_picture(tangents: Array, camera: CameraFacts, margin_px: float) -> Ma
     at = seen_pixels(tangents, camera)
     size = np.array([camera.width, camera.height])
     return np.asarray(np.all((at >= margin_px) & (at <= size - 1 - margin_px), axis=1))
-
-
-def only(array: SpotArray, shown: Mask) -> SpotArray:
-    """Return the array with some of its spots dark."""
-    return replace(array, amplitude=np.where(shown, array.amplitude, 0.0))
-
-
-__all__ = [
-    "Places",
-    "in_the_picture",
-    "light_foreseen",
-    "only",
-    "peaks_foreseen",
-    "pixel_tan",
-    "places_of_pair",
-    "recipe",
-]
