@@ -54,7 +54,7 @@ def test_the_enlarged_map_is_the_map():
     columns, rows = as_remap(seen_over(SHAPE, (40, 48)), SHAPE, SHAPE)
     exact = seen_over(SHAPE, SHAPE)
     off = np.maximum(np.abs(columns - exact[..., 0]), np.abs(rows - exact[..., 1]))
-    assert off[5:-5, 5:-5].max() < 1e-3 and off.max() < 0.03  # the outermost cells' halves are extrapolated
+    assert off[5:-5, 5:-5].max() < 5e-3 and off.max() < 0.03  # the outermost cells' halves are extrapolated
 
 
 def test_the_map_and_its_inverse_meet_to_a_hundredth_of_a_pixel():
