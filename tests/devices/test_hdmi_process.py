@@ -37,17 +37,20 @@ levels = np.random.default_rng(0).integers(0, 256, (540, 960), np.uint8)
 
 def test_sigterm_and_sigint_reach_python_while_the_window_is_up(x_server: XServer) -> None:
     code = """
-def stop(number, frame):
-    slm.close()
-    print("python got", signal.Signals(number).name, flush=True)
-    raise SystemExit(7)
+def stop(number, frame):  # as `holocal.loop.signals` has it: leave by an exception, and close on the way out
+    raise KeyboardInterrupt(signal.Signals(number).name)
 
 slm.show(levels)
 for number in (signal.SIGTERM, signal.SIGINT):
     signal.signal(number, stop)
-print("up", flush=True)
-while True:
-    slm.show(levels)
+try:
+    print("up", flush=True)
+    while True:
+        slm.show(levels)
+except KeyboardInterrupt as stopped:
+    slm.close()
+    print("python got", stopped, flush=True)
+    raise SystemExit(7)
 """
     for number in (signal.SIGTERM, signal.SIGINT):
         child = start(code, x_server)
