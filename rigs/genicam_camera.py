@@ -20,6 +20,7 @@ from holocal.errors import ConfigError, DeviceError
 from holocal.loop.devices import Finding, Frame
 from holocal.records.facts import CameraFacts
 from holocal.records.validate import validated
+from holocal.units import DEGREE
 from rigs import genicam_settings
 from rigs.context import DriverContext
 from rigs.genicam_discovery import asking, connect, find, serial_of, text_of, viva
@@ -247,6 +248,9 @@ def _facts(camera: viva_genicam.Camera, table: GenicamTable, bounds: genicam_set
         vendor=text_of(camera, "DeviceVendorName"),
         model=text_of(camera, "DeviceModelName"),
         serial=serial_of(camera),
+        rotation_rad=table.rotation_deg * DEGREE,
+        k1=table.k1,
+        k2=table.k2,
     )
 
 

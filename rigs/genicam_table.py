@@ -24,6 +24,8 @@ class GenicamTable(Table):
     `interface` is the network card that it hangs on, by address or name. The region of interest is `width` x `height`
     pixels from `offset_x`, `offset_y` of the sensor; `field_deg` is the full angle that its width covers. `shift_bits`
     drops low bits of a camera that sends its counts left-justified. `gain_db` is left as it is where it is not given.
+    `rotation_deg`, `k1` and `k2` are its geometry in the bench's frame, so after the mounting's turns, as a calibration
+    target tells them: positive turns the camera from +x towards +y; the lens is OpenCV's (`holocal.estimate.camera_lens`).
     """
 
     driver: Literal["genicam"] = "genicam"
@@ -37,6 +39,9 @@ class GenicamTable(Table):
     offset_x: int = Field(default=0, ge=0, le=65535)
     offset_y: int = Field(default=0, ge=0, le=65535)
     field_deg: float = Field(gt=0.0, le=120.0)
+    rotation_deg: float = Field(default=0.0, ge=-180.0, le=180.0)
+    k1: float = Field(default=0.0, ge=-10.0, le=10.0)
+    k2: float = Field(default=0.0, ge=-100.0, le=100.0)
     pixel_format: PixelFormat = "Mono12"
     shift_bits: int = Field(default=0, ge=0, le=8)
     gain_db: float | None = Field(default=None, ge=-100.0, le=100.0)

@@ -242,6 +242,7 @@ def _camera(identity: Mapping[str, Any], said: Mapping[str, Any] | None, grabs: 
         vendor=identity["camera.vendor"],
         model=identity["camera.model"],
         serial=identity["camera.serial"],
+        **{name: float((said or {}).get(name, 0.0)) for name in ("rotation_rad", "k1", "k2")},
     )
 
 

@@ -56,6 +56,9 @@ class CameraTable(Table):
     frames: str | None = Field(default=None, min_length=1)
     bits: int | None = Field(default=None, ge=1, le=16)
     field_deg: float | None = Field(default=None, gt=0.0, le=120.0)
+    rotation_deg: float = Field(default=0.0, ge=-180.0, le=180.0)
+    k1: float = Field(default=0.0, ge=-10.0, le=10.0)
+    k2: float = Field(default=0.0, ge=-100.0, le=100.0)
     exposure_s: float | None = Field(default=None, gt=0.0, le=3600.0)
     # A camera rounds an exposure to its line time, and a float to 64 bits; another procedure's are tens of percent off.
     exposure_tolerance: float = Field(default=0.01, ge=0.0, le=1.0)
@@ -68,6 +71,9 @@ class CameraTable(Table):
         wrong = [key for key, value in known.items() if (value is None) != (self.run is not None)]
         if wrong and self.run is not None:
             raise ValueError(f"a run says {', '.join(wrong)} itself")
+        geometry = [key for key in ("rotation_deg", "k1", "k2") if getattr(self, key)]
+        if geometry and self.run is not None:
+            raise ValueError(f"a run says {', '.join(geometry)} itself")
         if wrong:
             raise ValueError(f"frames do not say {', '.join(wrong)}: add it")
         return self
@@ -257,6 +263,9 @@ def _camera_of_pictures(counts: Counts, table: CameraTable, context: DriverConte
         exposure_max_s=table.exposure_s,
         bits=table.bits,
         model="recorded pictures",
+        rotation_rad=math.radians(table.rotation_deg),
+        k1=table.k1,
+        k2=table.k2,
     )
     exposure_s = table.exposure_s
     grabs = tuple(Grab(f"frame {i + 1}", None, exposure_s, exposure_s, i) for i in range(len(counts)))

@@ -214,6 +214,7 @@ def test_what_is_no_record_is_refused(tmp_path: Path) -> None:
         ({}, "either run or frames"),
         ({"run": "a", "frames": "b"}, "either run or frames"),
         ({"run": "a", "bits": 12}, "a run says bits itself"),
+        ({"run": "a", "k1": 0.01, "rotation_deg": 1.0}, "a run says rotation_deg, k1 itself"),
         ({"frames": "a", "bits": 12}, "frames do not say field_deg, exposure_s"),
         ({"frame": "a"}, r"unknown key frame\. Did you mean frames\?"),
     ],
@@ -239,8 +240,9 @@ def test_pictures_of_any_origin_come_in_the_order_of_their_names(tmp_path: Path,
     for number, counts in reversed(list(enumerate(sent))):
         write_counts(tmp_path / "pictures" / f"{number:03d}.png", counts)
     (tmp_path / "pictures" / "notes.txt").write_text("not a frame")
-    camera = camera_of(tmp_path, frames)
+    camera = camera_of(tmp_path, frames, rotation_deg=2.0, k1=0.01, k2=-0.02)
     facts = camera.describe()
+    assert (facts.rotation_rad, facts.k1, facts.k2) == (pytest.approx(np.deg2rad(2.0)), 0.01, -0.02)
     assert (facts.width, facts.height, facts.full_scale) == (64, 48, 4095)
     # Square pixels: the tangents of half the field are as 64 to 48.
     assert np.tan(facts.field_rad[1] / 2) == pytest.approx(np.tan(facts.field_rad[0] / 2) * 48 / 64)

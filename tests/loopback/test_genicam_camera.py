@@ -85,12 +85,13 @@ def test_forty_frames_of_changing_exposure_are_each_the_fresh_one_pixel_by_pixel
 
 
 def test_full_scale_is_that_of_the_pixel_format_and_the_rest_is_the_cameras_own_word(server):
-    camera = opened(pixel_format="Mono12p", max_exposure_s=0.02)
+    camera = opened(pixel_format="Mono12p", max_exposure_s=0.02, rotation_deg=-1.5, k1=0.01, k2=-0.02)
     facts = camera.describe()
     camera.close()
     assert (facts.full_scale, facts.bits) == (4095, 12)
     assert (facts.vendor, facts.model, facts.serial) == ("holocal", "bench on libaravis", "C-42")
     assert (facts.exposure_min_s, facts.exposure_max_s) == (pytest.approx(30e-6), pytest.approx(0.02))
+    assert (facts.rotation_rad, facts.k1, facts.k2) == (pytest.approx(np.deg2rad(-1.5)), 0.01, -0.02)
     assert np.rad2deg(facts.field_rad[0]) == pytest.approx(25.0)
     assert np.tan(facts.field_rad[1] / 2) == pytest.approx(np.tan(facts.field_rad[0] / 2) * 240 / 320)
 
