@@ -13,6 +13,7 @@ from holocal.estimate.picture_map import FourCorners
 from holocal.estimate.smooth_map import SmoothMap
 from holocal.loop.devices import Frame
 from holocal.loop.procedure import Conclusion, Figure
+from holocal.records.facts import CameraFacts
 from holocal.units import DEGREE
 from procedures._distortion_map import array_of, corners_of, map_of, measured
 from procedures._distortion_points import Places, dark_subtracted, places_of_pair
@@ -102,7 +103,14 @@ def conclusion(state: State, frames: Sequence[Frame]) -> Conclusion:
                 "wavelength_nm": chosen.wavelength_nm,
             },
         },
-        figures=_figures(pictures, sent, places, wanted, check, maps, extent, chosen.target_max_px),
+        figures=_figures(
+            pictures,
+            _arrows(sent, places, camera),
+            _arrows(wanted, check, camera),
+            maps,
+            extent,
+            chosen.target_max_px,
+        ),
     )
 
 
@@ -172,12 +180,20 @@ def _model(found: SmoothMap | FourCorners) -> dict[str, Any]:
     }
 
 
+def _arrows(wanted_px: Array, places: Places, camera: CameraFacts) -> NDArray[np.float32]:
+    """Return the spots found, (n, 4): x and y wanted in degrees, and how far right and up they are seen, pixels."""
+    wanted, off = wanted_px[places.found], (places.ideal_px - wanted_px)[places.found]
+    return np.column_stack([np.degrees(np.arctan(ideal_tangents(wanted, camera))), off * [1, -1]]).astype(np.float32)
+
+
+def _without_mean(arrows: NDArray[np.float32]) -> NDArray[np.float32]:
+    return arrows - np.concatenate([np.zeros(2), arrows[:, 2:].mean(axis=0)]).astype(np.float32)
+
+
 def _figures(
     pictures: list[Array],
-    sent: Array,
-    places: Places,
-    wanted: Array,
-    check: Places,
+    before: NDArray[np.float32],
+    after: NDArray[np.float32],
     maps: Maps,
     extent: tuple[float, float, float, float],
     limit_px: float,
@@ -185,10 +201,7 @@ def _figures(
     """Return the report's pictures: the spots, how far off they are, the map's shift and its error."""
     brightest = [max(float(np.quantile(one, 0.9995)), 1.0) for one in pictures]
     shown = [np.clip(one / top, 0, 1).astype(np.float32) for one, top in zip(pictures, brightest, strict=True)]
-    off = {
-        "before": np.linalg.norm((places.ideal_px - sent)[places.found], axis=1),
-        "after": np.linalg.norm((check.ideal_px - wanted)[check.found], axis=1),
-    }
+    off_px = np.linalg.norm(after[:, 2:], axis=1)
     return (
         Figure(
             "spots", "The spots, as sent and through the map", "pair", {"before": shown[0], "after": shown[1]},
@@ -196,7 +209,13 @@ def _figures(
         ),
         Figure(
             "off_after", "Distance of the verification's spots from where they should be", "histogram",
-            {"values": off["after"]}, "px", f"{len(off['after'])} spots that the map has not seen.", target=limit_px,
+            {"values": off_px}, "px", f"{len(off_px)} spots that the map has not seen.", target=limit_px,
+        ),
+        Figure(
+            "arrows", "From where spots should be to where they are seen", "vectors",
+            {"before": before, "before, but for the mean shift": _without_mean(before), "after": after}, "px",
+            "Each panel has a scale of its own: its bar is as long as it says in camera pixels. Before: the spots of "
+            "the map. After: the verification's.", extent,
         ),
         Figure(
             "shift", "How far the map moves what is sent", "map",

@@ -25,7 +25,7 @@ class GenicamTable(Table):
     pixels from `offset_x`, `offset_y` of the sensor; `field_deg` is the full angle that its width covers. `shift_bits`
     drops low bits of a camera that sends its counts left-justified. `gain_db` is left as it is where it is not given.
     `rotation_deg`, `k1` and `k2` are its geometry in the bench's frame, so after the mounting's turns, as a calibration
-    target tells them: positive turns the camera from +x towards +y; the lens is OpenCV's (`holocal.estimate.camera_lens`).
+    target tells them: positive turns the camera from +x towards +y (`holocal.estimate.camera_lens`).
     """
 
     driver: Literal["genicam"] = "genicam"

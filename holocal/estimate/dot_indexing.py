@@ -9,9 +9,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation, maximum_filter, uniform_filter
+from scipy.ndimage import maximum_filter
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -195,14 +196,14 @@ def _grown(canvas: Canvas, search: _Search) -> Canvas:
             canvas, tried = wide, np.zeros(wide.cell.shape, np.int64)
         full = canvas.cell >= 0
         side = 2 * BRIDGES[bridge] + 1
-        rows, columns = np.nonzero(binary_dilation(full, np.ones((side, side), bool)) & ~full)
+        rows, columns = np.nonzero(_dilated(full, side) & ~full)
         bridge = 0 if _filled(canvas, search, tried, rows, columns) else bridge + 1
     return canvas
 
 
 def _filled(canvas: Canvas, search: _Search, tried: Integers, rows: Integers, columns: Integers) -> bool:
     """Fill the surest of some cells; return whether any was. `tried` keeps the support that a cell failed with."""
-    support = _sum_round((canvas.cell >= 0).astype(np.int64), 2 * REACH + 1)[rows, columns]
+    support = _sum_round(canvas.cell >= 0, 2 * REACH + 1)[rows, columns]
     open_ = support > tried[rows, columns]
     rows, columns = rows[open_], columns[open_]
     if not len(rows):
@@ -248,12 +249,12 @@ def _consistent(canvas: Canvas, dots: Places) -> Canvas:
         size = np.where(full, off / (least * limit), 0)
         # Only the worst of each neighbourhood: its neighbours may be blamed for it.
         wrong = (size > 1) & (size >= maximum_filter(size, 3))
-        lonely = full & (_sum_round(full.astype(np.int64), 3) - 1 < COMPANIONS)
+        lonely = full & (_sum_round(full, 3) - 1 < COMPANIONS)
         out = wrong | lonely
         if not out.any():
             break
         cell[out] = -1
-        stale = binary_dilation(out, np.ones((2 * REACH + 1,) * 2, bool))
+        stale = _dilated(out, 2 * REACH + 1)
     return Canvas(cell, steps)
 
 
@@ -314,6 +315,10 @@ def _trimmed(row: Integers, column: Integers) -> NDArray[np.bool_]:
     return kept
 
 
-def _sum_round(values: Integers, side: int) -> Integers:
-    mean = uniform_filter(values.astype(np.float64), side, mode="constant")
-    return np.asarray(np.rint(side**2 * mean), np.int64)
+def _dilated(cells: NDArray[np.bool_], side: int) -> NDArray[np.bool_]:
+    return np.asarray(cv2.dilate(cells.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
+
+
+def _sum_round(cells: NDArray[np.bool_], side: int) -> Integers:
+    total = cv2.boxFilter(cells.astype(np.uint8), cv2.CV_32S, (side, side), normalize=False, borderType=0)
+    return np.asarray(total, np.int64)

@@ -77,11 +77,12 @@ class Plan:
 class Figure:
     """A picture for the report: its data, not its drawing.
 
-    `kind` is "map", "image", "curve", "pair", "histogram", "sheet" or "corner". A sheet is a contact sheet: "sheet"
-    (rows x cell, columns x cell) from 0 to 1, "rows" (rows,) the values that its rows were taken with, `labels` its
-    columns, and "best" (columns,) the value to mark in each, NaN for none. A corner shows the "samples" (k, d) of a
-    posterior, at most the first 12 parameters, with the names `labels`; its arrays "truth" (d,), "laplace_mean" (d,)
-    and "laplace_covariance" (d, d) are drawn over them where they are given.
+    `kind` is "map", "image", "curve", "pair", "histogram", "vectors", "sheet" or "corner". Vectors are arrays (n, 4),
+    a panel for each: x and y in degrees, to the right and up in `unit`. A sheet is a contact sheet: "sheet" (rows x
+    cell, columns x cell) from 0 to 1, "rows" (rows,) the values that its rows were taken with, `labels` its columns,
+    and "best" (columns,) the value to mark in each, NaN for none. A corner shows the "samples" (k, d) of a posterior,
+    at most the first 12 parameters, with the names `labels`; its arrays "truth" (d,), "laplace_mean" (d,) and
+    "laplace_covariance" (d, d) are drawn over them where they are given.
     """
 
     name: str

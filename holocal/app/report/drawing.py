@@ -53,6 +53,10 @@ def draw(figure: Figure) -> str:
                 from holocal.app.report.sheet import draw_sheet
 
                 canvas = draw_sheet(figure)
+            case "vectors":
+                from holocal.app.report.vectors import draw_vectors
+
+                canvas = draw_vectors(figure)
             case _:
                 canvas = _map(figure)
         return data_uri(canvas)
