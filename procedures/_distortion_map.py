@@ -17,6 +17,7 @@ from holocal.estimate.picture_map import FourCorners, outermost
 from holocal.estimate.smooth_map import SmoothMap
 from holocal.loop.devices import Frame
 from procedures._aberration_spots import SpotArray, recipe_levels, spots_at, zone_directions
+from procedures._bench_light import ArrayLight, array_light, fit_light, moved_px
 from procedures._distortion_points import (
     Places,
     evenly_bright,
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 FEWEST = 12  # spots that make a map
+ROUGHEST_PX = 1.0  # of a map, at spots held out: a bench's own leaves below 0.1
 EDGE_PX = 4.0  # of the picture: a spot nearer is not asked for
 _MADE: OrderedDict[str, SpotArray] = OrderedDict()
 _KEPT = 3
@@ -41,8 +43,7 @@ _KEPT = 3
 def array_of(state: State, grid: int) -> SpotArray:
     """Return the spots of a grid: 0 and 1 are measured, 2 verifies; the last three are kept."""
     chosen, camera = state.parameters, state.facts.camera
-    side = chosen.points + (0, 1, -1)[grid]
-    tangents = state.sent_tan if grid == 2 else zone_directions(side, camera.field_rad)
+    tangents = (zone_directions(chosen.points, camera.field_rad), state.second_tan, state.sent_tan)[grid]
     key = repr((state.facts, chosen.wavelength_nm, tangents.tobytes()))
     if key not in _MADE:
         _MADE[key] = evenly_bright(spots_at(state.facts, chosen.wavelength_nm * 1e-9, tangents))
@@ -101,21 +102,78 @@ def with_first(state: State, frame: Frame) -> State:
 
 
 def measured(state: State) -> tuple[Array, Places]:
-    """Return where the measured spots were sent and where they are seen, in ideal pixels, of all grids together."""
-    sent, parts = [], []
-    for grid in range(int(state.grids.max()) + 1):
-        array = array_of(state, grid)
-        pair = np.flatnonzero(state.grids == grid)
-        parts.append(
-            places_of_pair(array, list(state.pictures[pair]), state.exposures_s[pair].tolist(), state.reference)
-        )
-        sent.append(ideal_pixels(array.field_tan, state.facts.camera))
+    """Return where the measured spots were sent and where a picture's points would be seen, of all grids together."""
+    grids = _places_of_grids(state)
+    places = [moved(state, grid, own) for grid, own in enumerate(grids)]
+    sent = [ideal_pixels(array_of(state, grid).field_tan, state.facts.camera) for grid in range(len(grids))]
     return np.concatenate(sent), Places(
-        *(
-            np.concatenate([getattr(part, name) for part in parts])
-            for name in ("ideal_px", "camera_px", "sigma_px", "found")
-        )
+        np.concatenate([one.ideal_px for one in places]),
+        np.concatenate([one.camera_px for one in places]),
+        np.concatenate([one.sigma_px for one in places]),
+        np.concatenate([one.found for one in places]),
+        np.concatenate([one.either_px for one in places], axis=1),
     )
+
+
+def _places_of_grids(state: State) -> list[Places]:
+    """Return where the camera sees the spots of every grid that was measured."""
+    pairs = [np.flatnonzero(state.grids == grid) for grid in range(int(state.grids.max()) + 1)]
+    return [
+        places_of_pair(
+            array_of(state, grid),
+            list(state.pictures[pair]),
+            state.exposures_s[pair].tolist(),
+            state.reference,
+            wanted_tan=_second_wanted(state) if grid == 1 else None,
+        )
+        for grid, pair in enumerate(pairs)
+    ]
+
+
+def _second_wanted(state: State) -> Array:
+    return zone_directions(state.parameters.points + 1, state.facts.camera.field_rad)
+
+
+def with_second_grid(state: State) -> State:
+    """Return the state with where the second grid is sent, so that it is seen all over the camera's picture.
+
+    A bench far out of line moves the picture by a tenth of its width: what is to be seen at one side is sent from
+    beyond it. The first grid's homography says where from, to a few pixels.
+    """
+    camera = state.facts.camera
+    (places,) = _places_of_grids(state)
+    sent = ideal_pixels(array_of(state, 0).field_tan, camera)
+    wanted = _second_wanted(state)
+    if np.count_nonzero(places.found) < FEWEST:
+        return replace(state, second_tan=wanted)
+    fitted = fit_smooth_map(sent[places.found], places.ideal_px[places.found], sigma_px=places.sigma_px[places.found])
+    back, _ = FourCorners(fitted.homography).inverse(ideal_pixels(wanted, camera))
+    return replace(state, second_tan=ideal_tangents(back, camera))
+
+
+def moved(state: State, grid: int, places: Places) -> Places:
+    """Return a grid's places with the spots moved to where a picture's points are seen (`procedures._bench_light`)."""
+    if not len(state.light_values):
+        return places
+    return replace(places, ideal_px=places.ideal_px + moved_px(_light_of(state, grid), state.light_values))
+
+
+def with_light(state: State) -> State:
+    """Return the state with the beam and the bench that explain the spots of all grids that were measured."""
+    grids = _places_of_grids(state)
+    if sum(int(np.count_nonzero(own.found)) for own in grids) < FEWEST:
+        return state
+    fit = fit_light(
+        [_light_of(state, grid) for grid in range(len(grids))],
+        [np.where(own.found[:, None], own.either_px, np.nan) for own in grids],
+        [np.sqrt(2.0) * own.sigma_px for own in grids],
+    )
+    return replace(state, light_values=fit.values)
+
+
+def _light_of(state: State, grid: int) -> ArrayLight:
+    array = array_of(state, grid)
+    return array_light(array, [recipe(array, sign, (0,)) for sign in (1.0, -1.0)])
 
 
 def map_of(state: State, sent: Array, places: Places) -> SmoothMap | FourCorners:
@@ -138,7 +196,18 @@ def map_of(state: State, sent: Array, places: Places) -> SmoothMap | FourCorners
         )
     if state.parameters.mode == "corners":
         return corners_of(sent, places)
-    return fit_smooth_map(sent[known], places.ideal_px[known], sigma_px=places.sigma_px[known])
+    found = fit_smooth_map(sent[known], places.ideal_px[known], sigma_px=places.sigma_px[known])
+    if found.holdout_rms_px > ROUGHEST_PX:
+        raise RefusedError(
+            f"no smooth map explains where the spots are seen: it misses spots that it has not seen by "
+            f"{found.holdout_rms_px:.2g} px (rms); the limit is {ROUGHEST_PX:g} px.",
+            why="Spots were taken for others, or light that is no spot was taken for one.",
+            fix="See the report's pictures: look for reflections, and align the bench roughly.",
+            measured=found.holdout_rms_px,
+            limit=ROUGHEST_PX,
+            code="no-smooth-map",
+        )
+    return found
 
 
 def corners_of(sent: Array, places: Places) -> FourCorners:
@@ -150,6 +219,7 @@ def corners_of(sent: Array, places: Places) -> FourCorners:
 def with_map(state: State) -> State:
     """Return the state with what the map's inverse sends for the verification's spots."""
     camera = state.facts.camera
+    state = with_light(state)
     sent, places = measured(state)
     found = map_of(state, sent, places)
     wanted = zone_directions(state.parameters.points - 1, camera.field_rad)

@@ -24,12 +24,14 @@ COARSE = 32  # pixels of the panel: how finely the light's shares are foreseen
 PEAK_OVER_MEAN = 2.2  # of a defocused spot
 ROUNDS, MOST_BOOST = 5, 4.0  # of the sharing of brightness; amplitude over the median spot's
 COHERENT = 0.78  # pi / 4: what the phase of a sum of many waves keeps of each, of its share of the light
-LEAST_LIT = 0.02  # of the pupil: spots with 1 % were seen up to 1.3 px from where exact rays have them
+LEAST_LIT = 0.04  # of the pupil: spots with 2 % were seen up to 0.7 px from where exact rays have them, with 1 % 1.3 px
+WIDEST_BLUR_PX = 4.0  # half of what diffraction at the pupil's lit part makes of a spot: its tails have no middle
 MARGIN_PX = 4  # of a window round a spot: what an aberration of 2 rad throws out; more lets in other light
 SIGMA_PX = 4.0
 BLURS_PX = (4.0, 8.0)  # of the pattern that is looked for: a bench far out bends the picture by more than a spot
 FAINTEST_SIGMAS, FAINTEST_SHARE = 8.0, 0.01  # of a spot's light: over its noise, and of the median spot's
 WORST_PX = 0.2  # of a centroid's error: above, the spot is not seen
+WORSE, WORSE_PX = 2.0, 0.06  # or above both, times the median's: strips of a pupil, up to 0.7 px from exact rays
 CROSSTALK_PX = 0.03  # of a centroid: what the encoding leaves of the other spots' light in a window
 LARGEST_SPLIT_PX = 25.0  # between the two defoci of a spot
 
@@ -37,12 +39,14 @@ LARGEST_SPLIT_PX = 25.0  # between the two defoci of a spot
 @dataclass(frozen=True)
 class Places:
     """Where n spots are seen: `ideal_px` (n, 2) as a camera without a geometry of its own would see them, `sigma_px`
-    (n,) of each coordinate, `found` (n,). `camera_px` (n, 2) are places in the picture itself."""
+    (n,) of each coordinate, `found` (n,). `camera_px` (n, 2) are places in the picture itself, `either_px` (2, n, 2)
+    those of `ideal_px` in the two pictures of opposite defocus."""
 
     ideal_px: Array
     camera_px: Array
     sigma_px: Array
     found: Mask
+    either_px: Array
 
 
 def recipe(array: SpotArray, sign: float, seeds: Sequence[int]) -> Recipe:
@@ -86,9 +90,11 @@ def peaks_foreseen(array: SpotArray, rate: float) -> Array:
 def evenly_bright(array: SpotArray) -> SpotArray:
     """Return the array with amplitudes that make all spots as bright, as far as the panel's light goes.
 
-    A spot of whose pupil the panel lights less than `LEAST_LIT`, a strip, is blurred to one side: it is left dark.
+    A spot of whose pupil the panel lights but a strip is blurred to one side: it is left dark.
     """
-    array = replace(array, amplitude=np.where(array.lit >= LEAST_LIT, array.amplitude, 0.0))
+    blur_px = array.wavelength_m / (2 * array.half_m.min(axis=1)) / array.pixel_tan
+    strip = (array.lit < LEAST_LIT) | (blur_px > WIDEST_BLUR_PX)
+    array = replace(array, amplitude=np.where(strip, 0.0, array.amplitude))
     on = array.on
     for _ in range(ROUNDS if on.any() else 0):
         peaks = peaks_foreseen(array, 1.0)
@@ -151,8 +157,10 @@ def places_of_pair(
     found &= array.on & (split <= LARGEST_SPLIT_PX)
     mean = (centre[0] + centre[1]) / 2
     sigma = np.sqrt((variance[0] + variance[1]) / 4 + CROSSTALK_PX**2)
-    ideal = ideal_pixels(seen_tangents(mean, camera), camera)
-    return Places(ideal, mean, sigma, found)
+    if found.any():
+        found &= sigma <= max(WORSE_PX, WORSE * float(np.median(sigma[found])))
+    either = np.stack([ideal_pixels(seen_tangents(one, camera), camera) for one in centre])
+    return Places(either.mean(axis=0), mean, sigma, found, either)
 
 
 def _pitch_px(array: SpotArray) -> float:

@@ -15,7 +15,7 @@ from holocal.loop.devices import Frame
 from holocal.loop.procedure import Conclusion, Figure
 from holocal.records.facts import CameraFacts
 from holocal.units import DEGREE
-from procedures._distortion_map import array_of, corners_of, map_of, measured
+from procedures._distortion_map import array_of, corners_of, map_of, measured, moved
 from procedures._distortion_points import Places, dark_subtracted, places_of_pair
 
 if TYPE_CHECKING:
@@ -38,6 +38,7 @@ def conclusion(state: State, frames: Sequence[Frame]) -> Conclusion:
         array, [frame.counts for frame in frames], [frame.exposure_s for frame in frames], state.reference,
         wanted_tan=state.wanted_tan,
     )  # fmt: skip
+    check = moved(state, 2, check)
     expected = array.on
     before = _side(
         places.ideal_px - sent, places.found, int(np.concatenate([array_of(state, g).on for g in _grids(state)]).sum())

@@ -1,9 +1,10 @@
 """Distortion: where the picture is seen against where it was sent, and the map that sends it where it is to be seen.
 
 Spots at known field angles are shown in pairs of opposite defocus, so that each is 6 pixels wide and its middle is
-where it is in focus; one coherent spot has no speckle. Two irregular grids make the map (`mode` grid: a homography,
-polynomials and a spline as far as held-out spots want them; `mode` corners: the thesis's homography of the four
-outermost spots), a third, sent through the inverse map, verifies it.
+where it is in focus; one coherent spot has no speckle. Two irregular grids make the map, the second sent where the
+first says that it will fill the camera's picture (`mode` grid: a homography, polynomials and a spline as far as
+held-out spots want them; `mode` corners: the thesis's homography of the four outermost spots), a third, sent through
+the inverse map, verifies it.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ CLIPPED, FAINT = 1e-4, 0.04  # share of clipped pixels; of full scale, the brigh
 SEARCHES = 4
 CLIP_LIMIT = 3e-4
 VERIFICATION = 1000  # the step number that seeds the verification's phases
-MEASURED = ((0, -1.0), (1, 1.0), (1, -1.0))  # grid and sign of the defocus of the frames after the first
+FIRST, SECOND = ((0, -1.0),), ((1, 1.0), (1, -1.0))  # grid and sign of the defocus of the frames after the first
 VERIFIED = (1.0, -1.0)
 
 
@@ -52,8 +53,10 @@ class State:
     """Everything the loop knows between steps.
 
     `pictures` (n, height, width) of the frames taken, `exposures_s` (n,), `grids` (n,) which grid each shows.
-    `exposure_s` 0 means that it is still looked for, from `guess_s`. `sent_tan` and `wanted_tan` (k, 2) are the
-    verification's spots, `light_seen` how many of the k spots measured were found; empty before the map is made.
+    `exposure_s` 0 means that it is still looked for, from `guess_s`. `second_tan` (m, 2) is where the second grid is
+    sent, empty before the first is seen. `sent_tan` and `wanted_tan` (k, 2) are the
+    verification's spots, `light_values` the beam and bench that explain the spots (`procedures._bench_light`); empty
+    before the map is made.
     """
 
     facts: RigFacts
@@ -68,8 +71,10 @@ class State:
     pictures: Pictures
     exposures_s: Array
     grids: NDArray[np.int64]
+    second_tan: Array
     sent_tan: Array
     wanted_tan: Array
+    light_values: Array
     rms_px: float
     noise_px: float
 
@@ -82,13 +87,13 @@ class Distortion:
 
     def plan(self, facts: RigFacts, parameters: Parameters) -> Plan:
         """Return what a run would do, touching nothing."""
-        more = len(_measured(parameters))
+        more = len(FIRST) + len(SECOND) * (parameters.mode == "grid")
         frames = 1 + more + len(VERIFIED)
         megapixels = facts.slm.width * facts.slm.height / 1e6
         shown = parameters.points**2 + (parameters.points + 1) ** 2 * (parameters.mode == "grid")
         return Plan(
             frames=frames,
-            steps=2,
+            steps=3 if parameters.mode == "grid" else 2,
             expected_seconds=5 + frames * (0.3 + 0.5 * megapixels),
             exposure_ceiling_s=facts.camera.exposure_max_s,
             sentences=(
@@ -114,8 +119,10 @@ class Distortion:
             pictures=np.zeros((0, *shape), np.uint16),
             exposures_s=np.zeros(0),
             grids=np.zeros(0, np.int64),
+            second_tan=np.zeros((0, 2)),
             sent_tan=np.zeros((0, 2)),
             wanted_tan=np.zeros((0, 2)),
+            light_values=np.zeros(0),
             rms_px=float("nan"),
             noise_px=float("nan"),
         )
@@ -127,21 +134,24 @@ class Distortion:
         return replace(state, reference=reference, guess_s=first_guess_s(state, reference.rate))
 
     def stimuli(self, state: State) -> Iterator[Shot]:
-        """Yield the first frame, then the others of both grids."""
+        """Yield the first frame, then its grid with the other defocus, then the second grid with both."""
         if state.exposure_s == 0:
             yield self._shot(state, 0, 1.0, state.step, 0, exposure_s=state.guess_s, clip_limit=1.0, keep=True)
             return
-        for number, (grid, sign) in enumerate(_measured(state.parameters)):
+        for number, (grid, sign) in enumerate(_next(state)):
             yield self._shot(state, grid, sign, state.step, number, exposure_s=state.exposure_s)
 
     def update(self, state: State, frames: tuple[Frame, ...]) -> State:
         """Return the state with the exposure found, or with the map of all spots."""
-        from procedures._distortion_map import with_first, with_map
+        from procedures._distortion_map import with_first, with_map, with_second_grid
 
         state = replace(state, step=state.step + 1)
         if state.exposure_s == 0:
             return with_first(state, frames[0])
-        return with_map(with_frames(state, frames, [grid for grid, _ in _measured(state.parameters)]))
+        state = with_frames(state, frames, [grid for grid, _ in _next(state)])
+        if state.parameters.mode == "grid" and not len(state.second_tan):
+            return with_second_grid(state)
+        return with_map(state)
 
     def progress(self, state: State) -> dict[str, Any]:
         """Return the journal line of the last step."""
@@ -159,9 +169,8 @@ class Distortion:
     def judge(self, state: State) -> Judgement:
         """Return whether to go on: the map is made once, and verified."""
         if not len(state.sent_tan):
-            return Judgement(
-                Outcome.CONTINUE, "looking for the exposure" if state.exposure_s == 0 else "exposure found"
-            )
+            found = "the first grid is seen" if len(state.second_tan) else "exposure found"
+            return Judgement(Outcome.CONTINUE, "looking for the exposure" if state.exposure_s == 0 else found)
         said = f"spots are {state.rms_px:.2f} px (rms) from where they were sent, each known to {state.noise_px:.3f} px"
         return Judgement(Outcome.TARGET_MET, f"{said}: mapped, and verified with others")
 
@@ -206,9 +215,9 @@ class Distortion:
         )
 
 
-def _measured(parameters: Parameters) -> Sequence[tuple[int, float]]:
-    """Return grid and sign of the frames after the first."""
-    return MEASURED if parameters.mode == "grid" else MEASURED[:1]
+def _next(state: State) -> Sequence[tuple[int, float]]:
+    """Return grid and sign of the frames that come next, once the exposure is known."""
+    return SECOND if len(state.second_tan) else FIRST
 
 
 def with_frames(state: State, frames: Sequence[Frame], grids: Sequence[int]) -> State:
