@@ -143,9 +143,9 @@ def nominal_bench(facts: RigFacts) -> Bench:
     return Bench.nominal(pupil_diameter_m=facts.pupil_diameter_m, eye_relief_m=facts.eye_relief_m)
 
 
-def spots_at(facts: RigFacts, wavelength_m: float, field_tan: Array) -> SpotArray:
-    """Return spots in directions with tangents (n, 2), made for a rig's nominal bench."""
-    camera, bench = facts.camera, nominal_bench(facts)
+def spots_at(facts: RigFacts, wavelength_m: float, field_tan: Array, bench: Bench | None = None) -> SpotArray:
+    """Return spots in directions with tangents (n, 2), made for a bench, a rig's nominal one if none is given."""
+    camera, bench = facts.camera, bench or nominal_bench(facts)
     panel = Panel(facts.slm.width, facts.slm.height, facts.slm.pitch_m)
     waves = spot_waves(bench, panel, VirtualPoints.at(field_tan), wavelength_m=wavelength_m)
     x, y = waves.block_grid(_BLOCK)

@@ -23,8 +23,12 @@ from procedures._aberration_spots import EDGE_M, Array, Recipe, SpotArray, added
 
 BLOCK = 128  # pixels of the panel: one ray of each spot; 32 give the same to 0.01 px
 BEAM = ("beam_x", "beam_y", "beam_xx", "beam_yy")  # natural logarithm of its intensity at the panel's edge
-PARAMETERS = (*BEAM, *DISPLACEMENTS)
-PRIOR = np.concatenate([[0.5, 0.5, 2.0, 2.0], np.ones(len(DISPLACEMENTS))])  # degrees and mm
+CAMERA = ("camera_x", "camera_y", "camera_roll", "camera_scale")  # pixels, of roll and scale at the picture's edge
+NUISANCE = (*BEAM, *CAMERA)
+PARAMETERS = (*NUISANCE, *DISPLACEMENTS)
+BEAM_PRIOR = (0.5, 0.5, 2.0, 2.0)
+CAMERA_PX = 0.05  # how well a simulated camera's pointing, roll and scale are taken to be known
+PRIOR = np.concatenate([BEAM_PRIOR, [CAMERA_PX] * len(CAMERA), np.ones(len(DISPLACEMENTS))])  # degrees and mm
 MODEL_PX = 0.04  # of a middle that the model cannot tell: crosstalk, the pixels' own light
 
 
@@ -47,30 +51,8 @@ def array_light(array: SpotArray, recipes: Sequence[Recipe]) -> ArrayLight:
     )
 
 
-def fit_light(lights: Sequence[ArrayLight], middle_px: Sequence[Array], sigma_px: Sequence[Array]) -> PoseFit:
-    """Return the bench and the beam that explain middles (recipes, spots, 2), ideal pixels, of arrays' spots.
-
-    `sigma_px` (spots,) are their errors in each coordinate; what is not finite does not count.
-    """
-    rays = [own for light in lights for own in light.shown]
-    measured = np.concatenate([np.asarray(one).ravel() for one in middle_px])
-    sigma = [
-        np.broadcast_to(np.hypot(own, MODEL_PX)[None, :, None], np.shape(one)).ravel()
-        for own, one in zip(sigma_px, middle_px, strict=True)
-    ]
-    model = _Model(lights[0].array, rays)
-    return fit_pose(model.places_px, measured, np.concatenate(sigma), PRIOR)
-
-
-def moved_px(light: ArrayLight, values: Array) -> Array:
-    """Return by how much (spots, 2) a picture's points lie off the mean of the middles of their spots, pixels."""
-    model = _Model(light.array, [*light.shown, light.alone])
-    places = model.places_px(values).reshape(len(light.shown) + 1, -1, 2)
-    return np.asarray(np.nan_to_num(places[-1] - places[:-1].mean(axis=0)))
-
-
-class _Model:
-    """Where rays are seen, by beam and pose; the last pose's are kept, since the beam costs next to nothing."""
+class LightModel:
+    """Where an array's rays are seen, by beam and pose; the last pose's are kept, as the beam costs next to nothing."""
 
     def __init__(self, array: SpotArray, rays: Sequence[PanelRays]) -> None:
         self._array, self._rays = array, rays
@@ -81,19 +63,70 @@ class _Model:
 
     def places_px(self, values: Array) -> Array:
         """Return (rays' spots x 2,) ideal pixels for the values of `PARAMETERS`."""
-        beam, pose = values[: len(BEAM)], values[len(BEAM) :]
+        beam, turned, pose = np.split(values, [len(BEAM), len(NUISANCE)])
         if pose.tobytes() != self._pose:
-            bench, radius = bench_at(self._nominal, pose), self._array.facts.pupil_diameter_m / 2
+            bench = bench_at(self._nominal, pose)
             self._landed = each(lambda k: landed(bench, self._rays[k]), len(self._rays))
-            self._passed = [soft_disc(at.pupil_m, radius, EDGE_M) ** 2 for at in self._landed]
+            self._passed = [pupil_light(self._array, at) for at in self._landed]
             self._pose = pose.tobytes()
-        half = np.asarray(self._array.panel.half_size_m)
         found = []
         for at, passed, rays in zip(self._landed, self._passed, self._rays, strict=True):
-            u = rays.slm_m / half
-            light = rays.light * passed * np.exp(u @ beam[:2] + u**2 @ beam[2:])
-            found.append(ideal_pixels(middles(at, light, rays.first), self._array.facts.camera).ravel())
+            light = rays.light * passed * beam_light(self._array, beam, rays.slm_m)
+            found.append(self._seen(ideal_pixels(middles(at, light, rays.first), self._array.facts.camera), turned))
         return np.concatenate(found)
+
+    def _seen(self, places: Array, turned: Array) -> Array:
+        """Return (spots x 2,) places (spots, 2) as a camera sees them that is off by `CAMERA`."""
+        camera = self._array.facts.camera
+        u = (places - (np.array([camera.width, camera.height]) - 1) / 2) / (camera.width / 2)
+        across = np.stack([-u[:, 1], u[:, 0]], axis=1)
+        return np.asarray((places + turned[:2] + turned[2] * across + turned[3] * u).ravel())
+
+
+def pupil_light(array: SpotArray, at: Landed) -> Array:
+    """Return what the camera's pupil lets through of rays, (n,)."""
+    return soft_disc(at.pupil_m, array.facts.pupil_diameter_m / 2, EDGE_M) ** 2
+
+
+def beam_light(array: SpotArray, beam: Array, slm_m: Array) -> Array:
+    """Return the beam's intensity at places (n, 2) of the panel, (n,), for the values of `BEAM`; 1 in the middle."""
+    u = slm_m / np.asarray(array.panel.half_size_m)
+    return np.asarray(np.exp(u @ beam[:2] + u**2 @ beam[2:]))
+
+
+@dataclass(frozen=True)
+class SpotData:
+    """What a fit explains: `middles_px` (m,), ideal pixels, with errors `sigma_px` (m,), NaN where none is known; the
+    `model` says where they would be."""
+
+    model: LightModel
+    middles_px: Array
+    sigma_px: Array
+
+
+def spot_data(lights: Sequence[ArrayLight], middle_px: Sequence[Array], sigma_px: Sequence[Array]) -> SpotData:
+    """Return the data of arrays whose spots have middles (recipes, spots, 2), each coordinate with errors (spots,)."""
+    sigma = [
+        np.broadcast_to(np.hypot(own, MODEL_PX)[None, :, None], np.shape(one)).ravel()
+        for own, one in zip(sigma_px, middle_px, strict=True)
+    ]
+    return SpotData(
+        LightModel(lights[0].array, [own for light in lights for own in light.shown]),
+        np.concatenate([np.asarray(one).ravel() for one in middle_px]),
+        np.concatenate(sigma),
+    )
+
+
+def fit_light(data: SpotData, prior: Array = PRIOR) -> PoseFit:
+    """Return the beam and the bench (`PARAMETERS`) that explain the data, and had errors `prior` (p,) before."""
+    return fit_pose(data.model.places_px, data.middles_px, data.sigma_px, prior)
+
+
+def moved_px(light: ArrayLight, values: Array) -> Array:
+    """Return by how much (spots, 2) a picture's points lie off the mean of the middles of their spots, pixels."""
+    model = LightModel(light.array, [*light.shown, light.alone])
+    places = model.places_px(values).reshape(len(light.shown) + 1, -1, 2)
+    return np.asarray(np.nan_to_num(places[-1] - places[:-1].mean(axis=0)))
 
 
 def _grid(array: SpotArray) -> tuple[Array, Array]:

@@ -17,7 +17,7 @@ from holocal.estimate.picture_map import FourCorners, outermost
 from holocal.estimate.smooth_map import SmoothMap
 from holocal.loop.devices import Frame
 from procedures._aberration_spots import SpotArray, recipe_levels, spots_at, zone_directions
-from procedures._bench_light import ArrayLight, array_light, fit_light, moved_px
+from procedures._bench_light import ArrayLight, SpotData, array_light, fit_light, moved_px, spot_data
 from procedures._distortion_points import (
     Places,
     evenly_bright,
@@ -160,15 +160,20 @@ def moved(state: State, grid: int, places: Places) -> Places:
 
 def with_light(state: State) -> State:
     """Return the state with the beam and the bench that explain the spots of all grids that were measured."""
-    grids = _places_of_grids(state)
-    if sum(int(np.count_nonzero(own.found)) for own in grids) < FEWEST:
+    data = spots_seen(state)
+    if np.count_nonzero(np.isfinite(data.middles_px)) < 4 * FEWEST:
         return state
-    fit = fit_light(
+    return replace(state, light_values=fit_light(data).values)
+
+
+def spots_seen(state: State) -> SpotData:
+    """Return the middles of the spots of all grids that were measured, in either picture of opposite defocus."""
+    grids = _places_of_grids(state)
+    return spot_data(
         [_light_of(state, grid) for grid in range(len(grids))],
         [np.where(own.found[:, None], own.either_px, np.nan) for own in grids],
         [np.sqrt(2.0) * own.sigma_px for own in grids],
     )
-    return replace(state, light_values=fit.values)
 
 
 def _light_of(state: State, grid: int) -> ArrayLight:

@@ -31,7 +31,7 @@ SIGMA_PX = 4.0
 BLURS_PX = (4.0, 8.0)  # of the pattern that is looked for: a bench far out bends the picture by more than a spot
 FAINTEST_SIGMAS, FAINTEST_SHARE = 8.0, 0.01  # of a spot's light: over its noise, and of the median spot's
 WORST_PX = 0.2  # of a centroid's error: above, the spot is not seen
-WORSE, WORSE_PX = 2.0, 0.06  # or above both, times the median's: strips of a pupil, up to 0.7 px from exact rays
+WORSE, WORSE_PX = 2.0, 0.09  # or above both, times the median's: strips of a pupil, up to 0.7 px from exact rays
 CROSSTALK_PX = 0.03  # of a centroid: what the encoding leaves of the other spots' light in a window
 LARGEST_SPLIT_PX = 25.0  # between the two defoci of a spot
 

@@ -32,24 +32,30 @@ def against_truth(done: Conclusion, truth: Mapping[str, Any]) -> dict[str, Any]:
     panel = Panel(int(facts["panel_width"]), int(facts["panel_height"]), facts["pitch_m"])
     wavelength_m = 1e-9 * float(facts["wavelength_nm"])
     bench = true_bench(nominal, truth)
-    x, own = panel_points(panel, truth, wavelength_m)
-
-    beam = illumination(x, truth)
-    pupil_area = np.pi * (nominal.pupil_diameter_m / 2) ** 2
-
-    def seen(tangent: Array) -> Array:
-        light = light_of_spot(nominal, bench, x, own, tangent, wavelength_m)
-        if light is None or light.amount.sum() < LEAST_LIT * pupil_area:
-            return np.full(2, np.nan)
-        sent = pixel_light(nominal, panel, x, tangent, wavelength_m)
-        return middle(replace(light, amount=light.amount * beam * sent), wavelength_m)
-
-    after = np.stack(each(lambda k: seen(sent[k]), len(sent))) - wanted
-    before = np.stack(each(lambda k: seen(wanted[k]), len(wanted))) - wanted
+    after = seen_tangents_of(nominal, bench, panel, truth, sent, wavelength_m) - wanted
+    before = seen_tangents_of(nominal, bench, panel, truth, wanted, wavelength_m) - wanted
     return {
         "residual_px": _summary(after / facts["pixel_tan"]),
         "before_px": _summary(before / facts["pixel_tan"]),
     }
+
+
+def seen_tangents_of(
+    drawn: Bench, bench: Bench, panel: Panel, truth: Mapping[str, Any], sent: Array, wavelength_m: float
+) -> Array:
+    """Return where points sent along tangents (n, 2) by holograms for a drawn bench are seen on a true one, (n, 2)."""
+    x, own = panel_points(panel, truth, wavelength_m)
+    beam = illumination(x, truth)
+    pupil_area = np.pi * (drawn.pupil_diameter_m / 2) ** 2
+
+    def seen(tangent: Array) -> Array:
+        light = light_of_spot(drawn, bench, x, own, tangent, wavelength_m)
+        if light is None or light.amount.sum() < LEAST_LIT * pupil_area:
+            return np.full(2, np.nan)
+        pixels = pixel_light(drawn, panel, x, tangent, wavelength_m)
+        return middle(replace(light, amount=light.amount * beam * pixels), wavelength_m)
+
+    return np.stack(each(lambda k: seen(sent[k]), len(sent))) if len(sent) else np.zeros((0, 2))
 
 
 def illumination(x: Array, truth: Mapping[str, Any]) -> Array:

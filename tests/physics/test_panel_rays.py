@@ -11,7 +11,7 @@ from holocal.optics.panel_rays import landed, middles, panel_rays
 from holocal.optics.phase_function import VirtualPoints, exact_phase
 from holocal.records.facts import CameraFacts, RigFacts, SlmFacts
 from procedures._aberration_spots import Recipe, spots_at
-from procedures._bench_light import BEAM, PARAMETERS, array_light, fit_light, moved_px
+from procedures._bench_light import NUISANCE, PARAMETERS, LightModel, array_light, fit_light, moved_px, spot_data
 
 GREEN = 515e-9
 PANEL = Panel(960, 540, 3.74e-6)
@@ -104,17 +104,15 @@ def lights():
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_pose_and_beam_that_explain_the_spots_say_where_a_pictures_points_lie(lights, sign):
-    from procedures._bench_light import _Model
-
     rng = np.random.default_rng(5)
-    truth = np.concatenate([[0.1, -0.1, -1.0, -0.5], sign * OFF])
+    truth = np.concatenate([[0.1, -0.1, -1.0, -0.5, 0.0, 0.0, 0.0, 0.0], sign * OFF])
     noise_px = 0.03
     middles_px, sigma = [], []
     for light in lights:
-        places = _Model(light.array, light.shown).places_px(truth).reshape(2, -1, 2)
+        places = LightModel(light.array, light.shown).places_px(truth).reshape(2, -1, 2)
         middles_px.append(places + noise_px * rng.standard_normal(places.shape))
         sigma.append(np.where(light.array.on, noise_px, np.nan))
-    found = fit_light(lights, middles_px, sigma)
+    found = fit_light(spot_data(lights, middles_px, sigma))
     assert found.scale < 1.5
     for light in lights:
         on = light.array.on
@@ -130,7 +128,7 @@ def test_pose_and_beam_that_explain_the_spots_say_where_a_pictures_points_lie(li
 
 
 def test_parameters_are_the_beams_and_the_twelve_displacements():
-    assert (*BEAM, *DISPLACEMENTS) == PARAMETERS
+    assert (*NUISANCE, *DISPLACEMENTS) == PARAMETERS
     assert DISPLACEMENTS[0] == "mirror_rx_deg"
     assert DISPLACEMENTS[-1] == "slm_dz_mm"
     bench = bench_at(Bench.nominal(), OFF)
