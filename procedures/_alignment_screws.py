@@ -51,7 +51,7 @@ class Effects:
 
 
 def effects_of(state: State) -> Effects:
-    """Return the effects of every displacement, differences halfway between the aligned bench and the one found."""
+    """Return the effects of every displacement, differences halfway between the drawn bench and the one found."""
     light, beam, values = zone_light(state), state.values[: len(BEAM)], state.values[len(NUISANCE) :]
 
     def seen(pose: Array) -> Seen:

@@ -27,9 +27,9 @@ CAMERA = ("camera_x", "camera_y", "camera_roll", "camera_scale")  # pixels, of r
 NUISANCE = (*BEAM, *CAMERA)
 PARAMETERS = (*NUISANCE, *DISPLACEMENTS)
 BEAM_PRIOR = (0.5, 0.5, 2.0, 2.0)
-CAMERA_PX = 0.05  # how well a simulated camera's pointing, roll and scale are taken to be known
+CAMERA_PX = 0.02  # how well a simulated camera's pointing, roll and scale are taken to be known
 PRIOR = np.concatenate([BEAM_PRIOR, [CAMERA_PX] * len(CAMERA), np.ones(len(DISPLACEMENTS))])  # degrees and mm
-MODEL_PX = 0.04  # of a middle that the model cannot tell: crosstalk, the pixels' own light
+MODEL_PX = 0.02  # of a middle that the model cannot tell: crosstalk, the pixels' own light
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,7 @@ class Parameters(BaseModel):
     `tolerance_px` and `tolerance_rad` are what an aligned bench may leave: the picture's displacement and the wavefront
     (both rms over the field), which the moves of the screws are to reach. `verify_nm` is the colour that the prediction
     is verified in, 0 the rig's farthest from `wavelength_nm`. `camera_px` is how well the camera's own pointing, roll
-    and scale are known, pixels at the picture's edge; 0: 0.05 of a simulated camera, 2 of a real one. What is not known
+    and scale are known, pixels at the picture's edge; 0: 0.02 of a simulated camera, 2 of a real one. What is not known
     of the camera is not told of the bench.
     """
 

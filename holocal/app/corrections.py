@@ -6,6 +6,9 @@
 | distortion | ``correction.shift_tan_x``, ``correction.shift_tan_y`` | a point's direction, added to its tangents |
 | aberration | ``correction.noll_<j>_rad`` at ``wavelength_nm`` | the points' phase functions |
 | response | ``correction.phase_rad``, a column per level, at ``wavelength_nm`` | the levels, within 2 nm of that line |
+| alignment | the maps' metadata ``bench.<displacement>`` | the bench that holograms are made for |
+
+The bench that `alignment` found explains distortion and aberration both: these are left out while it is in force.
 
 Maps are rectilinear over their ``extent_deg``, row 0 on top, of directions seen from the eye, not from the gaze.
 """
@@ -19,6 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from holocal.errors import InputError
+from holocal.estimate.bench_pose import DISPLACEMENTS, bench_at
 from holocal.hologram.scenes.points import PointCloud
 from holocal.hologram.wavefront import Wavefront, field_basis
 from holocal.optics.bench import Array, Bench
@@ -28,7 +32,7 @@ from holocal.units import DEGREE, NM
 
 __all__ = ["PHASE", "RESPONSE", "Corrections", "FieldMap", "corrections_of"]
 
-UNIFORMITY, DISTORTION, ABERRATION = "uniformity", "distortion", "aberration"
+UNIFORMITY, DISTORTION, ABERRATION, ALIGNMENT = "uniformity", "distortion", "aberration", "alignment"
 WEIGHT = "correction.intensity_weight"
 SHIFTS = ("correction.shift_tan_x", "correction.shift_tan_y")
 NOLL = re.compile(r"correction\.noll_(\d+)_rad")
@@ -39,19 +43,27 @@ _FIELD_DEGREE = 5  # of a Zernike coefficient over the field; the residual of th
 class Corrections:
     """What the accepted calibration does to a scene.
 
-    `weight` and `shift` map directions; `wavefront` and `response` are for the engine; `identities` names the
-    corrections in force that change nothing and are left out.
+    `weight` and `shift` map directions; `wavefront`, `response` and `displacements` (12,) are for the engine;
+    `identities` names the corrections in force that change nothing and are left out, `superseded` those that the bench
+    found by `alignment` stands in for.
     """
 
     weight: FieldMap | None = None
     shift: tuple[FieldMap, FieldMap] | None = None
     wavefront: Wavefront | None = None
     response: PhaseResponse | None = None
+    displacements: Array | None = None
     identities: tuple[str, ...] = ()
+    superseded: tuple[str, ...] = ()
+
+    def bench(self, nominal: Bench) -> Bench:
+        """Return the bench that holograms are made for: the one that `alignment` found, or the one drawn."""
+        return nominal if self.displacements is None else bench_at(nominal, self.displacements)
 
     def skipped(self, wavelength_nm: float) -> list[str]:
         """Return a sentence for each correction in force that a frame of this line goes without."""
         said = [f"the accepted {name}: it changes nothing" for name in self.identities]
+        said += [f"the accepted {name}: the accepted bench (alignment) explains it" for name in self.superseded]
         left_out = self.response.left_out(wavelength_nm) if self.response else ""
         return [*said, left_out] if left_out else said
 
@@ -115,6 +127,10 @@ def corrections_of(accepted: Mapping[str, Accepted], *, fov_rad: tuple[float, fl
         An accepted run has not the channels that its procedure promises.
     """
     found, identities = Corrections(), []
+    if one := accepted.get(ALIGNMENT):
+        superseded = tuple(name for name in (DISTORTION, ABERRATION) if name in accepted)
+        accepted = {name: other for name, other in accepted.items() if name not in superseded}
+        found = replace(found, displacements=_displacements(one), superseded=superseded)
     if one := accepted.get(UNIFORMITY):
         weight = _map(one, WEIGHT)
         identities += _kept_out(UNIFORMITY, bool(np.all(weight.values == 1)))
@@ -132,6 +148,13 @@ def corrections_of(accepted: Mapping[str, Accepted], *, fov_rad: tuple[float, fl
         identities += _kept_out(RESPONSE, response.is_identity())
         found = replace(found, response=None if RESPONSE in identities else response)
     return replace(found, identities=tuple(identities))
+
+
+def _displacements(accepted: Accepted) -> Array:
+    values = [accepted.maps.metadata.get(f"bench.{name}") for name in DISPLACEMENTS]
+    if any(value is None for value in values):
+        raise _missing(accepted, "the displacements of its bench (metadata bench.*)")
+    return np.array([float(str(value)) for value in values])
 
 
 def _kept_out(name: str, identity: bool) -> list[str]:

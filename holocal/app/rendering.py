@@ -201,7 +201,9 @@ def _settings(
 ) -> HologramSettings:
     return HologramSettings(
         panel=Panel(facts.slm.width, facts.slm.height, facts.slm.pitch_m),
-        bench=Bench.nominal(pupil_diameter_m=facts.pupil_diameter_m, eye_relief_m=facts.eye_relief_m),
+        bench=corrections.bench(
+            Bench.nominal(pupil_diameter_m=facts.pupil_diameter_m, eye_relief_m=facts.eye_relief_m)
+        ),
         wavelength_m=wavelength_nm * NM,
         fov_rad=(asked.fov_deg[0] * DEGREE, asked.fov_deg[1] * DEGREE),
         gaze_rad=(asked.gaze_deg[0] * DEGREE, asked.gaze_deg[1] * DEGREE),

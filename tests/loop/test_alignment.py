@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from holocal.app.corrections import corrections_of
 from holocal.estimate.bench_pose import DISPLACEMENTS, bench_at, spun
 from holocal.loop.record import RunRecord
 from holocal.loop.runner import run
 from holocal.optics.bench import Bench
+from holocal.records.calibration import Accepted
 from holocal.records.maps import read_maps
 from holocal.records.rig import load_rig
 from procedures.alignment import Alignment, Parameters
@@ -75,6 +77,16 @@ def test_what_is_accepted_is_the_bench(found):
     maps = read_maps(directory / "maps.exr")
     for name in DISPLACEMENTS:
         assert float(maps.metadata[f"bench.{name}"]) == pytest.approx(result["after"][name]["mean"], abs=1e-6)
+    accepted = {
+        name: Accepted(name, "entry", "2026-01-01T00:00:00Z", result, maps) for name in ("alignment", "aberration")
+    }
+    corrections = corrections_of(accepted, fov_rad=(0.4, 0.4))
+    values = np.array([result["after"][name]["mean"] for name in DISPLACEMENTS])
+    np.testing.assert_allclose(
+        corrections.bench(Bench.nominal()).slm_centre, bench_at(Bench.nominal(), values).slm_centre, atol=1e-8
+    )
+    assert corrections.wavefront is None
+    assert corrections.skipped(515.0) == ["the accepted aberration: the accepted bench (alignment) explains it"]
 
 
 def test_a_mirror_turned_about_its_own_axis_is_the_same_surface():
