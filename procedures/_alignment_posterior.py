@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from holocal.estimate.bench_pose import TAIL, spun
+from holocal.estimate.bench_pose import TAIL, residual_scale, spun
 from holocal.estimate.posterior import LaplaceFit, sample_posterior
 from procedures._aberration_spots import nominal_bench
 from procedures._bench_light import NUISANCE, SpotData
@@ -56,7 +56,7 @@ class Quadratic:
         slope, bend = ((ahead - behind) / 2) / data.sigma_px, np.stack(bends) / data.sigma_px
         self._used = np.isfinite(off) & np.isfinite(slope).all(axis=0) & np.isfinite(bend).all(axis=0)
         self._off, self._slope, bend = off[self._used], slope[:, self._used], bend[:, self._used]
-        self.scale = max(1.0, 1.4826 * float(np.median(np.abs(self._off))))
+        self.scale = residual_scale(self._off)
         weight = (TAIL + 1) / (TAIL + (self._off / self.scale) ** 2) / self.scale**2
         self._back = -(bend * weight) @ self._slope.T  # (pairs, d)
         self._bend = bend + self._back @ self._slope

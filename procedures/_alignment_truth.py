@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -18,13 +18,12 @@ from procedures._distortion_truth import seen_tangents_of
 Array = NDArray[np.float64]
 
 ZONES = 5  # each way, where the exact phase is compared
-VALID_LIT = 0.004
 
 
 def against_truth(done: Conclusion, truth: Mapping[str, Any]) -> dict[str, Any]:
     """Return the true displacements, how many standard errors off each combination is, and what the bench leaves.
 
-    `predicted_residual_rms_rad` and `position_px`: median and worst over the field, of holograms for the bench found.
+    Residuals are those of holograms for the bench found: the median over the field and the worst.
     """
     facts = done.extra["rig_facts"]
     diameter = (truth.get("camera") or {}).get("pupil_mm")
@@ -49,8 +48,10 @@ def against_truth(done: Conclusion, truth: Mapping[str, Any]) -> dict[str, Any]:
     )
     return {
         **dict(zip(DISPLACEMENTS, own.tolist(), strict=True)),
-        "predicted_residual_rms_rad": _summary(left),
-        "position_px": _summary(off_px),
+        "predicted_residual_rms_rad": _known(np.median, left),
+        "predicted_residual_worst_rad": _known(np.max, left),
+        "position_rms_px": _known(lambda off: np.sqrt(np.mean(off**2)), off_px),
+        "position_max_px": _known(np.max, off_px),
         "directions_off_sigma": [
             (one["value"] - float(np.array(one["vector"]) @ own)) / one["sigma"]
             for one in done.extra["directions"]
@@ -59,8 +60,6 @@ def against_truth(done: Conclusion, truth: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _summary(values: Array) -> dict[str, Any]:
+def _known(summary: Callable[[Array], Any], values: Array) -> float | None:
     known = values[np.isfinite(values)]
-    if not len(known):
-        return {"median": None, "worst": None, "points": 0}
-    return {"median": float(np.median(known)), "worst": float(known.max()), "points": len(known)}
+    return float(summary(known)) if len(known) else None

@@ -23,6 +23,7 @@ LINEAR = 0.05  # of the prior's standard deviations: over so much the middles ar
 ROUNDS, SETTLED = 16, 0.03  # Gauss-Newton steps; the last one, in standard errors
 POLISHED = 3  # at most, of them with differences along the posterior's own axes
 TAIL = 4.0  # degrees of freedom of the residuals' Student distribution
+LEAST_SCALE = 0.6  # of residuals, over their errors: what a model lacks is alike from spot to spot, and partly unseen
 LARGEST_STEP = 1.0  # of the prior's standard deviations
 
 Predict = Callable[[Array], Array]
@@ -61,8 +62,8 @@ def spun(nominal: Bench, values: Array, angles_rad: Array) -> Array:
 class PoseFit:
     """A fitted pose: `values` (12,) degrees and mm; `covariance` (12, 12) with the prior; `information` (12, 12) of the
     data alone; `residual` (m,) in standard errors, measured less predicted; `jacobian` (m, 12) of the prediction;
-    `used` (m,); `scale`: how many times larger the residuals are than their standard errors say, at least 1, by which
-    the errors are widened."""
+    `used` (m,); `scale`: how many times larger the residuals are than their standard errors say, by which the errors
+    are widened."""
 
     values: Array
     covariance: Array
@@ -94,7 +95,7 @@ def fit_pose(predict: Predict, measured: Array, sigma: Array, prior_sigma: Array
         off = (measured - at) / sigma
         used = np.isfinite(off) & np.all(np.isfinite(jacobian), axis=1)
         off, slope = off[used], jacobian[used] / sigma[used, None]
-        scale = _scale(off)
+        scale = residual_scale(off)
         weight = (TAIL + 1) / (TAIL + (off / scale) ** 2) / scale**2
         normal = slope.T @ (weight[:, None] * slope) + precision
         step = np.linalg.solve(normal, slope.T @ (weight * off) - precision @ values)
@@ -137,6 +138,6 @@ def _axes(covariance: Array, prior_sigma: Array) -> Array:
     return np.asarray(prior_sigma[:, None] * vectors * np.minimum(np.sqrt(np.maximum(strength, 1e-18)), LINEAR))
 
 
-def _scale(off: Array) -> float:
-    """Return the residuals' robust size, at least 1."""
-    return max(1.0, 1.4826 * float(np.median(np.abs(off)))) if len(off) else 1.0
+def residual_scale(off: Array) -> float:
+    """Return the residuals' robust size, at least `LEAST_SCALE`."""
+    return max(LEAST_SCALE, 1.4826 * float(np.median(np.abs(off)))) if len(off) else 1.0
