@@ -113,6 +113,7 @@ def conclusion(state: State, fresh: Fringes) -> Conclusion:
             "before": "counts/s",
             "after": "counts/s",
         },
+        map_metadata={"axes": ("row", "level")},
         extra=_extra(state, check),
         figures=_figures(state, check, pictures),
     )

@@ -10,5 +10,6 @@ capturing       a frame shown and captured at an exposure found for it
 health          packages, plug-ins, devices seen, a rig's pre-flight
 terminal        progress and errors on stderr, results on stdout
 report          a run directory -> one self-contained page
+export          a run directory -> one file for other programs
 ==============  ==========================================================
 """

@@ -189,14 +189,17 @@ class RunRecord:
 
 
 def read_journal(directory: Path) -> list[dict[str, Any]]:
-    """Return the lines of a run's journal; a torn last line is left out."""
+    """Return the lines of a run's journal, up to the first that is torn."""
     path = directory / "events.jsonl"
     if not path.is_file():
         return []
     lines = []
     for text in path.read_text(encoding="utf-8", errors="replace").splitlines():
         try:
-            lines.append(json.loads(text))
-        except ValueError:
+            line = json.loads(text)
+        except (ValueError, RecursionError):
             break
+        if not isinstance(line, dict) or "event" not in line:
+            break
+        lines.append(line)
     return lines

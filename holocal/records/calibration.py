@@ -20,7 +20,7 @@ from typing import Any
 
 from holocal.errors import InputError, RefusedError
 from holocal.records.files import make_directory, read_json, storage_error, sync, write_json
-from holocal.records.manifest import problems, read_manifest
+from holocal.records.manifest import read_manifest, require_intact
 from holocal.records.maps import Maps, read_maps
 from holocal.records.rig import digest
 
@@ -191,14 +191,7 @@ def _check_complete(run: Path) -> None:
             limit="complete",
             code="not-complete",
         )
-    if found := problems(run):
-        raise InputError(
-            f"{run.name} is not what was measured: {' '.join(found)}",
-            fix="Measure again, or restore the files from a copy.",
-            measured=len(found),
-            limit=0,
-            code="damaged-run",
-        )
+    require_intact(run)
 
 
 def _check_corrections(

@@ -123,7 +123,7 @@ def read_json(path: Path) -> dict[str, Any]:
         raise InputError(f"{path} does not exist.", fix="Check the path.") from error
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}.") from error
-    except ValueError as error:  # JSON and Unicode errors both
+    except (ValueError, RecursionError) as error:  # JSON and Unicode errors both; brackets without end
         raise InputError(f"{path} is not a JSON file: {error}.") from error
     if not isinstance(value, dict):
         raise InputError(f"{path} holds a {type(value).__name__}; an object was expected.")

@@ -29,6 +29,7 @@ def test_help_imports_nothing_heavy():
         "report",
         "show",
         "verify",
+        "export",
         "render",
         "capture",
         "detect-grid",
