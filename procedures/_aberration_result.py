@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from hashlib import sha256
 from typing import TYPE_CHECKING, Any
@@ -164,6 +165,7 @@ def conclusion(state: State, fresh: State) -> Conclusion:
         map_units=units | {"before": "counts", "after": "counts"},
         map_metadata={"wavelength_nm": chosen.wavelength_nm},
         extent_deg=extent,
+        sigma={"before": sigmas_of(before), "after": sigmas_of(after)},
         extra={
             "mode": "model",
             "wavelength_nm": chosen.wavelength_nm,
@@ -259,6 +261,21 @@ def summarised(zones: list[dict[str, Any]]) -> dict[str, Any]:
         if rms
         else nothing,
         "zones": zones,
+    }
+
+
+def sigmas_of(side: Mapping[str, Any]) -> dict[str, float]:
+    """Return the standard errors of a side's median and worst wavefront.
+
+    The zones share their errors, so the median is known no better than a zone.
+    """
+    valid = [zone for zone in side["zones"] if zone["valid"] and zone["wavefront_sigma_rad"] is not None]
+    if not valid:
+        return {}
+    worst = max(valid, key=lambda zone: float(zone["wavefront_rms_rad"]))
+    return {
+        "median_wavefront_rms_rad": float(np.median([zone["wavefront_sigma_rad"] for zone in valid])),
+        "worst_wavefront_rms_rad": float(worst["wavefront_sigma_rad"]),
     }
 
 

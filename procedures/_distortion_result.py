@@ -76,6 +76,7 @@ def conclusion(state: State, frames: Sequence[Frame]) -> Conclusion:
         map_units=units | {"before": "counts", "after": "counts"},
         map_metadata={"pixel_tan": pixel_tan(camera)},
         extent_deg=extent,
+        sigma={"before": _sigma(places.ideal_px - sent, places), "after": _sigma(check.ideal_px - wanted, check)},
         extra={
             "mode": chosen.mode,
             "map": _model(found),
@@ -121,6 +122,17 @@ def _side(off: Array, found: NDArray[np.bool_], expected: int) -> dict[str, Any]
         "points_found": len(distance),
         "points_expected": expected,
     }
+
+
+def _sigma(off: Array, places: Places) -> dict[str, float]:
+    """Return the standard errors of a side's numbers, from those of its spots in each coordinate."""
+    distance, sigma = np.linalg.norm(off, axis=1)[places.found], places.sigma_px[places.found]
+    if not len(distance):
+        return {}
+    # The spots are a sample of the field: of n distances the rms is known to 1 / (2 sqrt(n)) of itself.
+    rms, count = float(np.sqrt(np.mean(distance**2))), len(distance)
+    noise = float(np.sqrt(np.mean(sigma**2) / count))
+    return {"rms_px": float(np.hypot(rms / (2 * np.sqrt(count)), noise)), "max_px": float(sigma[np.argmax(distance)])}
 
 
 def _maps(state: State, found: SmoothMap | FourCorners) -> tuple[Maps, dict[str, str]]:

@@ -42,6 +42,11 @@ class Verified:
     crosstalk_rad: float
     valid: bool
 
+    @property
+    def rms_sigma(self) -> float:
+        """The standard error of `rms_rad`: that of the rms of so many differences, one piston taken out."""
+        return float(max(self.rms_rad, self.noise_rad) / np.sqrt(2 * max(len(self.levels) - 1, 1)))
+
 
 def verified(state: State, fresh: Fringes) -> Verified:
     """Return how far the table is from the verification's phases, at the levels that it was not made from."""
@@ -114,9 +119,25 @@ def conclusion(state: State, fresh: Fringes) -> Conclusion:
             "after": "counts/s",
         },
         map_metadata={"axes": ("row", "level")},
+        sigma=_sigma(state, check),
         extra=_extra(state, check),
         figures=_figures(state, check, pictures),
     )
+
+
+def _sigma(state: State, check: Verified) -> dict[str, dict[str, float]]:
+    table = state.table
+    if table is None or not (table.valid and check.valid):
+        return {}
+    ends = np.zeros(state.count)
+    ends[[0, -1]] = -1, 1
+    return {
+        "before": {"phase_error_rms_rad": table.sigma_rms_rad},
+        "after": {
+            "phase_error_rms_rad": check.rms_sigma,
+            "range_rad": float(np.sqrt(np.maximum(ends @ table.covariance @ ends, 0.0))),
+        },
+    }
 
 
 def _extra(state: State, check: Verified) -> dict[str, Any]:

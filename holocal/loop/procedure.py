@@ -99,7 +99,9 @@ class Figure:
 class Conclusion:
     """What a procedure found: the numbers of the contract, the maps, the pictures.
 
-    `before`, `after`, `targets` have the contract's keys. `targets_met` is set by the procedure. `maps` go to
+    `before`, `after`, `targets` have the contract's keys. `sigma` has the standard errors of their numbers, under
+    "before" and "after" and, where a number lies in a table, the keys joined by "_" as in `targets`: what comparisons
+    over time are judged by. `targets_met` is set by the procedure. `maps` go to
     ``maps.exr`` (name -> (height, width) float32), `before_map` and `after_map` to ``before.exr`` and ``after.exr``;
     `calibration` holds what `accept` would put in force: JSON scalars here, arrays in `maps`.
     """
@@ -115,6 +117,7 @@ class Conclusion:
     map_units: Mapping[str, str] = field(default_factory=dict)
     map_metadata: Mapping[str, Any] = field(default_factory=dict)  # further metadata of the maps' file
     extent_deg: tuple[float, float, float, float] | None = None
+    sigma: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     extra: dict[str, Any] = field(default_factory=dict)  # further keys of result.json
     figures: tuple[Figure, ...] = ()
 

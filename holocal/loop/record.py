@@ -31,10 +31,10 @@ from holocal.records.frames import write_counts
 from holocal.records.manifest import NAME as MANIFEST
 from holocal.records.manifest import write_manifest
 from holocal.records.maps import write_maps
+from holocal.records.run_files import RUN_TIME
 
 LETTERS = "abcdefghijkmnpqrstuvwxyz23456789"  # none that are mistaken for each other
 LOGGER = logging.getLogger("holocal")
-RUN_TIME = "%Y%m%dT%H%M%SZ"  # of a run directory's name
 MOST_BAD_FRAMES = 16  # kept of those that tripped a gate: 1.1 MB each
 
 

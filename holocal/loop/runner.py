@@ -357,6 +357,7 @@ class _Loop:
             "before": conclusion.before,
             "after": conclusion.after,
             "targets": conclusion.targets,
+            "sigma": {side: dict(known) for side, known in conclusion.sigma.items()},
             "corrections": {name: found.entry for name, found in self.calibration.items()},
         }
         return dict(json_ready({**result, **extra}))

@@ -21,6 +21,9 @@ scene_views     the views of a light field, listed in a TOML file
 reading         a user's file opened, and what goes wrong said
 scene_toml      what the two lists have in common
 manifest        SHA-256 and size of every file of a run
+run_files       what a run directory says of itself, read without trust
+results         the numbers of a result, with sigma and target
+index           all runs, for questions about their history
 calibration     which accepted runs are in force for a rig
 ==============  ==========================================================
 """

@@ -214,8 +214,23 @@ def _state(directory: Path) -> dict[str, Any]:
     pointer = directory / "current.json"
     if not pointer.is_file():
         return {}
-    name = read_json(pointer)["state"]
-    return read_json(directory / "states" / f"{name}.json") if name else {}
+    name = read_json(pointer).get("state")
+    if not name:
+        return {}
+    state = read_json(directory / "states" / f"{name}.json") if _is_name(name) else {}
+    accepted = state.get("accepted")
+    if not isinstance(accepted, dict) or not all(map(_is_name, [*accepted, *accepted.values()])):
+        raise InputError(
+            f"{directory} is damaged: {name!r} is no state of its calibration.",
+            fix="Restore the directory from a copy, or move it away and measure again.",
+            code="damaged-calibration",
+        )
+    return state
+
+
+def _is_name(name: Any) -> bool:
+    """Return whether this is the name of something in its own directory."""
+    return isinstance(name, str) and name not in ("", ".", "..") and not set(name) & set("/\\\0")
 
 
 def _copy_entry(run: Path, directory: Path) -> None:
@@ -238,7 +253,7 @@ def _copy_entry(run: Path, directory: Path) -> None:
 
 def _advance(directory: Path, before: Mapping[str, Any], accepted: Mapping[str, str]) -> dict[str, Any]:
     states = make_directory(directory / "states")
-    number = 1 + max((int(path.stem) for path in states.glob("[0-9]*.json")), default=0)
+    number = 1 + max((int(path.stem) for path in states.glob("*.json") if path.stem.isdecimal()), default=0)
     state = {
         "schema": SCHEMA,
         "state": f"{number:04d}",

@@ -30,6 +30,8 @@ def test_help_imports_nothing_heavy():
         "show",
         "verify",
         "export",
+        "history",
+        "compare",
         "render",
         "capture",
         "detect-grid",

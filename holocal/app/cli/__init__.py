@@ -7,6 +7,7 @@ run, resume     measure; go on
 accept          put a result in force, or the one before
 report, show, verify   read what was done
 export                 a run for other programs
+history, compare       runs in time; two of them side by side
 render, capture        scene -> frame -> picture
 detect_grid            the grid of dots in a photograph
 rigs, procedures, doctor   what there is, and whether it works
