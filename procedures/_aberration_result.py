@@ -125,8 +125,8 @@ def conclusion(state: State, fresh: State) -> Conclusion:
     left = check.field.zones + correction
     sharp = (sharpness(state, found, 0.0), sharpness(fresh, check, 0.0))
     wider = retest(array, found, check)
-    before = _side(array, found, found.field.zones, wider**2 * found.field.zone_covariance, sharp[0], chosen.noll)
-    after = _side(array, check, left, wider**2 * check.field.zone_covariance, sharp[1], chosen.noll)
+    before = side_of(array, found, found.field.zones, wider**2 * found.field.zone_covariance, sharp[0], chosen.noll)
+    after = side_of(array, check, left, wider**2 * check.field.zone_covariance, sharp[1], chosen.noll)
     median, worst = after["median"]["wavefront_rms_rad"], after["worst"]["wavefront_rms_rad"]
     believed = int(check.valid.sum())
     lit = int(array.on.sum())
@@ -218,7 +218,7 @@ def geometry_of(state: State) -> dict[str, float]:
     }
 
 
-def _side(
+def side_of(
     array: SpotArray, found: Estimate, means: Array, covariance: Array, sharp: Array, noll: tuple[int, ...]
 ) -> dict[str, Any]:
     """Return `before` or `after`: every zone's numbers, and the median and the worst of those believed."""

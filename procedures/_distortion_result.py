@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Maps = dict[str, NDArray[np.float32]]
 
+FEWEST_SEEN = 0.8  # of the verification's spots
 GRID = 150  # of the exported maps, along the longer side: a bilinear reading of them is off by 0.001 px
 
 
@@ -38,12 +39,12 @@ def conclusion(state: State, frames: Sequence[Frame]) -> Conclusion:
         wanted_tan=state.wanted_tan,
     )  # fmt: skip
     expected = array.on
-    before = _side(
+    before = side_of(
         places.ideal_px - sent, places.found, int(np.concatenate([array_of(state, g).on for g in _grids(state)]).sum())
     )
-    after = _side(check.ideal_px - wanted, check.found, int(expected.sum()))
+    after = side_of(check.ideal_px - wanted, check.found, int(expected.sum()))
     met = after["rms_px"] <= chosen.target_rms_px and after["max_px"] <= chosen.target_max_px
-    met = met and after["points_found"] >= 0.8 * after["points_expected"]
+    met = met and after["points_found"] >= FEWEST_SEEN * after["points_expected"]
     corners = corners_of(sent, places)
     left = np.linalg.norm((corners(sent) - places.ideal_px)[places.found], axis=1)
     sentence = (
@@ -76,7 +77,7 @@ def conclusion(state: State, frames: Sequence[Frame]) -> Conclusion:
         map_units=units | {"before": "counts", "after": "counts"},
         map_metadata={"pixel_tan": pixel_tan(camera)},
         extent_deg=extent,
-        sigma={"before": _sigma(places.ideal_px - sent, places), "after": _sigma(check.ideal_px - wanted, check)},
+        sigma={"before": sigma_of(places.ideal_px - sent, places), "after": sigma_of(check.ideal_px - wanted, check)},
         extra={
             "mode": chosen.mode,
             "map": _model(found),
@@ -111,7 +112,7 @@ def _grids(state: State) -> range:
     return range(int(state.grids.max()) + 1)
 
 
-def _side(off: Array, found: NDArray[np.bool_], expected: int) -> dict[str, Any]:
+def side_of(off: Array, found: NDArray[np.bool_], expected: int) -> dict[str, Any]:
     """Return `before` or `after`: distances (n, 2) of the spots found."""
     distance = np.linalg.norm(off[found], axis=1)
     if not len(distance):
@@ -124,7 +125,7 @@ def _side(off: Array, found: NDArray[np.bool_], expected: int) -> dict[str, Any]
     }
 
 
-def _sigma(off: Array, places: Places) -> dict[str, float]:
+def sigma_of(off: Array, places: Places) -> dict[str, float]:
     """Return the standard errors of a side's numbers, from those of its spots in each coordinate."""
     distance, sigma = np.linalg.norm(off, axis=1)[places.found], places.sigma_px[places.found]
     if not len(distance):

@@ -8,7 +8,7 @@ holograms tell the sign. The verification measures other levels with another pat
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, Literal
@@ -22,7 +22,8 @@ from holocal.estimate.fringes import FEWEST_LEVELS, Fringes
 from holocal.estimate.registration import blob_image
 from holocal.estimate.response import ResponseTable, interpolate_response, next_levels, phase_difference, rms
 from holocal.loop.devices import Frame
-from holocal.loop.procedure import Conclusion, Judgement, Outcome, Plan, Shot
+from holocal.loop.procedure import Conclusion, Judgement, Outcome, Plan, Remeasured, Shot
+from holocal.loop.reference import Reference
 from holocal.records.facts import RigFacts
 from procedures._exposure import next_guess
 from procedures._holograms import Engine, image_levels, response_in_force
@@ -286,6 +287,20 @@ class Response:
         pixels = choose_pixels(frames, state.dark, camera)
         light = light_of(frames, state.dark, pixels, camera=camera, exposure_s=frames[0].exposure_s)
         return conclusion(state, phases_of(light, shown, range(len(shown))))
+
+    def remeasure(
+        self,
+        facts: RigFacts,
+        calibration: Mapping[str, Any],
+        parameters: Parameters,
+        reference: Reference,
+        seed: int,
+    ) -> Generator[Shot, Frame, Remeasured]:
+        """Yield the frames that measure the accepted table; return how far it is from them."""
+        from procedures._response_check import remeasured
+
+        state = self.start(facts, calibration, parameters, seed)
+        return remeasured(self, state, calibration[self.name])
 
     def against_truth(self, conclusion: Conclusion, truth: Mapping[str, Any]) -> dict[str, float]:
         """Return the error of the table against a simulated rig's own, piston taken out, for `result.json` alone."""

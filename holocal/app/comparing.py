@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from holocal.errors import InputError
-from holocal.records.files import read_json
+from holocal.records.files import read_json, read_toml
 from holocal.records.manifest import require_intact
-from holocal.records.reading import reading
 from holocal.records.results import SIDES, Number, numbers_of
 
 SIGNIFICANT = 3.0  # standard errors of a difference: chance exceeds them once in 370 numbers
@@ -145,12 +143,7 @@ def _result(run: Path) -> dict[str, Any]:
 
 
 def _configuration(run: Path) -> dict[str, Any]:
-    with reading(run / "config.toml"):
-        text = (run / "config.toml").read_text(encoding="utf-8")
-    try:
-        config = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{run / 'config.toml'} cannot be read: {error}.") from error
+    config = read_toml(run / "config.toml")
     return {key: config[key] for key in TOLD if key in config}
 
 

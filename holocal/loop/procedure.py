@@ -6,7 +6,7 @@ The runner alone touches devices, disk, clock and signals; a procedure never doe
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any, Protocol, TypeVar, runtime_checkable
@@ -198,3 +198,40 @@ class AgainstTruth(Protocol):
     def against_truth(self, conclusion: Conclusion, truth: Mapping[str, Any]) -> dict[str, Any]:
         """Return how far a conclusion is from the truth, JSON-ready."""
         ...
+
+
+@dataclass(frozen=True)
+class Remeasured:
+    """What a calibration leaves now: numbers under the keys of its result's `targets`, and their standard errors."""
+
+    after: Mapping[str, float]
+    sigma: Mapping[str, float]
+
+
+@runtime_checkable
+class Checkable(Protocol):
+    """What a procedure adds when its accepted result can be measured again in a few frames (`holocal check`)."""
+
+    def remeasure(
+        self, facts: RigFacts, calibration: Mapping[str, Any], parameters: Any, reference: Reference, seed: int
+    ) -> Generator[Shot, Frame, Remeasured]:
+        """Yield the shots under the calibration in force, be sent the frame of each, return what it leaves.
+
+        `calibration` is as in `start`, the procedure's own accepted run among it; `parameters` are those of that run,
+        `reference` is what the pre-flight learnt of the camera.
+
+        Raises
+        ------
+        RefusedError, InputError
+            The frames do not show what the calibration says they should.
+        """
+        ...
+
+
+def taken(shots: Iterable[Shot]) -> Generator[Shot, Frame, tuple[Frame, ...]]:
+    """Yield shots and return the frames that were sent for them: ``frames = yield from taken(shots)``."""
+    frames = []
+    for shot in shots:
+        frame = yield shot
+        frames.append(frame)
+    return tuple(frames)

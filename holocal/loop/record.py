@@ -10,7 +10,6 @@ import json
 import logging
 import os
 import secrets
-import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from datetime import UTC, datetime
@@ -26,7 +25,15 @@ from holocal.loop.environment import environment
 from holocal.loop.figures import write_figures
 from holocal.loop.lock import locked
 from holocal.loop.procedure import Conclusion
-from holocal.records.files import dump_json, make_directory, read_json, storage_error, write_bytes, write_json
+from holocal.records.files import (
+    dump_json,
+    make_directory,
+    read_json,
+    read_toml,
+    storage_error,
+    write_bytes,
+    write_json,
+)
 from holocal.records.frames import write_counts
 from holocal.records.manifest import NAME as MANIFEST
 from holocal.records.manifest import write_manifest
@@ -94,11 +101,7 @@ class RunRecord:
 
     def config(self) -> dict[str, Any]:
         """Return the resolved configuration that the run was started with."""
-        path = self.directory / "config.toml"
-        try:
-            return tomllib.loads(path.read_text(encoding="utf-8"))
-        except (OSError, tomllib.TOMLDecodeError) as error:
-            raise InputError(f"{path} cannot be read: {error}.") from error
+        return read_toml(self.directory / "config.toml")
 
     def check_identity(self, identity: Mapping[str, Any]) -> None:
         """Raise `RefusedError` when the rig is not the one that the run was started on."""

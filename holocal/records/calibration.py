@@ -2,7 +2,7 @@
 
 One directory per rig under ``HOLOCAL_HOME`` (default: the user's data directory)::
 
-    <home>/rigs/<rig>/entries/<run>/     identity.json, result.json, maps.exr: copied from the run, never changed
+    <home>/rigs/<rig>/entries/<run>/     what `ENTRY_FILES` names, copied from the run, never changed
     <home>/rigs/<rig>/states/0003.json   procedure -> entry, and the state before
     <home>/rigs/<rig>/current.json       which state is in force; swapped by one rename
 """
@@ -13,30 +13,31 @@ import os
 import shutil
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from holocal.errors import InputError, RefusedError
-from holocal.records.files import make_directory, read_json, storage_error, sync, write_json
+from holocal.records.files import make_directory, read_json, read_toml, storage_error, sync, write_json
 from holocal.records.manifest import read_manifest, require_intact
 from holocal.records.maps import Maps, read_maps
 from holocal.records.rig import digest
 
 SCHEMA = 1
-ENTRY_FILES = ("identity.json", "result.json", "maps.exr")
+ENTRY_FILES = ("identity.json", "config.toml", "result.json", "maps.exr")
 
 
 @dataclass(frozen=True)
 class Accepted:
-    """One accepted run: its result, its maps, and when it was accepted."""
+    """One accepted run: its result, its maps, when it was accepted, and the procedure's parameters."""
 
     procedure: str
     entry: str
     accepted_utc: str
     result: Mapping[str, Any]
     maps: Maps
+    parameters: Mapping[str, Any] = field(default_factory=dict)
 
 
 def home() -> Path:
@@ -87,6 +88,7 @@ def load(identity: Mapping[str, Any]) -> dict[str, Accepted]:
             str(state.get("accepted_utc", "")),
             read_json(folder / "result.json"),
             read_maps(folder / "maps.exr"),
+            dict(read_toml(folder / "config.toml").get("parameters", {})),
         )
     return loaded
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -10,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from holocal.errors import HolocalError
-from holocal.records.files import read_json
+from holocal.records.files import read_json, read_toml
 from holocal.records.manifest import NAME as MANIFEST
 
 RUN_TIME = "%Y%m%dT%H%M%SZ"  # of a run directory's name
@@ -119,8 +118,8 @@ def _json(path: Path) -> dict[str, Any]:
 
 def _toml(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8")) if _readable(path) else {}
-    except (OSError, ValueError, RecursionError):
+        return read_toml(path) if _readable(path) else {}
+    except HolocalError:
         return {}
 
 

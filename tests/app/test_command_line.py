@@ -26,6 +26,7 @@ def test_help_imports_nothing_heavy():
         "run",
         "resume",
         "accept",
+        "check",
         "report",
         "show",
         "verify",
