@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import replace
+from hashlib import sha256
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -36,6 +37,7 @@ FEWEST = 12  # spots that make a map
 EDGE_PX = 4.0  # of the picture: a spot nearer is not asked for
 _MADE: OrderedDict[str, SpotArray] = OrderedDict()
 _KEPT = 3
+_MEASURED: dict[str, tuple[Array, Places]] = {}
 
 
 def array_of(state: State, grid: int) -> SpotArray:
@@ -101,7 +103,19 @@ def with_first(state: State, frame: Frame) -> State:
 
 
 def measured(state: State) -> tuple[Array, Places]:
-    """Return where the measured spots were sent and where they are seen, in ideal pixels, of all grids together."""
+    """Return where the measured spots were sent and where they are seen, in ideal pixels, of all grids together.
+
+    The last is kept: the map's step and the conclusion ask for the same.
+    """
+    key = sha256(repr((state.facts, state.parameters, state.exposures_s.tolist(), state.grids.tolist())).encode())
+    key.update(np.ascontiguousarray(state.pictures).tobytes())
+    if key.hexdigest() not in _MEASURED:
+        _MEASURED.clear()
+        _MEASURED[key.hexdigest()] = _measured(state)
+    return _MEASURED[key.hexdigest()]
+
+
+def _measured(state: State) -> tuple[Array, Places]:
     sent, parts = [], []
     for grid in range(int(state.grids.max()) + 1):
         array = array_of(state, grid)

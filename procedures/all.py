@@ -28,7 +28,6 @@ from holocal.loop.procedure import (
     Judgement,
     Outcome,
     Plan,
-    Procedure,
     Shot,
     ToldOfCamera,
 )
@@ -46,7 +45,14 @@ from procedures.response import Response
 from procedures.uniformity import Parameters as UniformityParameters
 from procedures.uniformity import Uniformity
 
-STAGES: tuple[Procedure[Any], ...] = (Response(), Distortion(), Aberration(), Uniformity())
+STAGES: tuple[Any, ...] = (Response(), Distortion(), Aberration(), Uniformity())  # each a `Procedure`
+
+ENOUGH_RAD = 0.005  # expected error of the response's table: a quarter of its target
+
+
+def quick_response() -> ResponseParameters:
+    """Return the response's parameters where it is one of four: fewer levels, more only where the curve bends."""
+    return ResponseParameters(levels_per_step=5, verify_levels=8, enough_rad=ENOUGH_RAD)
 
 
 class Parameters(BaseModel):
@@ -54,7 +60,7 @@ class Parameters(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    response: ResponseParameters = Field(default_factory=ResponseParameters)
+    response: ResponseParameters = Field(default_factory=quick_response)
     distortion: DistortionParameters = Field(default_factory=DistortionParameters)
     aberration: AberrationParameters = Field(default_factory=AberrationParameters)
     uniformity: UniformityParameters = Field(default_factory=UniformityParameters)
@@ -70,7 +76,7 @@ class State:
     """Everything the loop knows between steps.
 
     `inner` is the state of stage number `stage`, `verifying` whether its loop has ended, `told` its last judgement.
-    `done` are the conclusions of the stages before; `others` names what else is in force on the bench.
+    `done` are the conclusions of the stages before.
     """
 
     facts: RigFacts
@@ -99,7 +105,7 @@ class All:
             expected_seconds=sum(plan.expected_seconds for plan in plans),
             exposure_ceiling_s=max(plan.exposure_ceiling_s for plan in plans),
             sentences=tuple(
-                f"{stage.name}: {sentence}" for stage, plan in zip(STAGES, plans, strict=True) for sentence in plan.sentences
+                f"{stage.name}: {said}" for stage, plan in zip(STAGES, plans, strict=True) for said in plan.sentences
             ),
             tolerated_drift=min(plan.tolerated_drift for plan in plans),
         )
@@ -164,10 +170,9 @@ class All:
 
     def against_truth(self, conclusion: Conclusion, truth: Mapping[str, Any]) -> dict[str, Any]:
         """Return how far each stage's result is from the simulated bench's truth."""
+        parts = zip(STAGES, conclusion.parts.items(), strict=True)
         return {
-            stage.name: stage.against_truth(conclusion.parts[stage.name], truth)
-            for stage in STAGES
-            if isinstance(stage, AgainstTruth)
+            name: stage.against_truth(part, truth) for stage, (name, part) in parts if isinstance(stage, AgainstTruth)
         }
 
 

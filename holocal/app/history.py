@@ -152,9 +152,14 @@ def _checks(rig: str) -> list[Check]:
 
 
 def _standing(run: str, accepted: dict[str, str], before: set[str]) -> str:
-    if run in accepted.values():
+    if _among(run, set(accepted.values())):
         return IN_FORCE
-    return BEFORE if run in before else ""
+    return BEFORE if _among(run, before) else ""
+
+
+def _among(run: str, entries: set[str]) -> bool:
+    """Return whether a run was accepted, or a part of it."""
+    return any(entry == run or entry.startswith(f"{run}.") for entry in entries)
 
 
 def _once_accepted(rig: str) -> set[str]:

@@ -137,10 +137,10 @@ def corrections(choice: str, rig: Mapping[str, Any]) -> dict[str, calibration.Ac
     calibration.check_identity(
         read_json(Path(choice) / "identity.json"),
         rig,
-        subject=f"run {found.entry}",
+        subject=f"run {Path(choice).name}",
         fix="Name a run of this rig, or `--corrections none`.",
     )
-    return {found.procedure: found}
+    return found
 
 
 def plan(procedure_name: str, rig: RigConfig, overrides: Mapping[str, Any]) -> dict[str, Any]:

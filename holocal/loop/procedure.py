@@ -101,9 +101,10 @@ class Conclusion:
 
     `before`, `after`, `targets` have the contract's keys. `sigma` has the standard errors of their numbers, under
     "before" and "after" and, where a number lies in a table, the keys joined by "_" as in `targets`: what comparisons
-    over time are judged by. `targets_met` is set by the procedure. `maps` go to
-    ``maps.exr`` (name -> (height, width) float32), `before_map` and `after_map` to ``before.exr`` and ``after.exr``;
-    `calibration` holds what `accept` would put in force: JSON scalars here, arrays in `maps`.
+    over time are judged by. `targets_met` is set by the procedure. `maps` go to ``maps.exr`` (name -> (height, width)
+    float32), `before_map` and `after_map` to ``before.exr`` and ``after.exr``; `calibration` holds what `accept` would
+    put in force: JSON scalars here, arrays in `maps`. `parts` are the results of a run of several procedures, by their
+    names, in the order in which they were measured; each is accepted as if it had been a run by itself.
     """
 
     before: dict[str, Any]
@@ -120,6 +121,7 @@ class Conclusion:
     sigma: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     extra: dict[str, Any] = field(default_factory=dict)  # further keys of result.json
     figures: tuple[Figure, ...] = ()
+    parts: Mapping[str, Conclusion] = field(default_factory=dict)
 
 
 State = TypeVar("State")

@@ -27,6 +27,7 @@ from holocal.loop.lock import locked
 from holocal.loop.procedure import Conclusion
 from holocal.records.files import (
     dump_json,
+    dump_toml,
     make_directory,
     read_json,
     read_toml,
@@ -166,15 +167,30 @@ class RunRecord:
 
     def conclusion(self, conclusion: Conclusion, result: Mapping[str, Any]) -> None:
         """Write the maps, the figures and ``result.json``."""
+        self._write_maps(self.directory, conclusion)
+        write_figures(self.directory, conclusion.figures)
+        write_json(self.directory / "result.json", result)
+
+    def part(self, name: str, conclusion: Conclusion, result: Mapping[str, Any]) -> None:
+        """Write one procedure's result of a run of several to a directory of its own, complete for `accept`."""
+        directory = make_directory(self.directory / name)
+        config = self.config()
+        own = {**config, "procedure": name, "parameters": config.get("parameters", {}).get(name, {})}
+        own.pop("origins", None)
+        write_bytes(directory / "config.toml", dump_toml(own).encode())
+        write_json(directory / "identity.json", read_json(self.directory / "identity.json"))
+        self._write_maps(directory, conclusion)
+        write_json(directory / "result.json", result)
+
+    def _write_maps(self, directory: Path, conclusion: Conclusion) -> None:
         shared = {"extent_deg": conclusion.extent_deg, "run": self.directory.name, **conclusion.map_metadata}
         units = dict(conclusion.map_units)
         for name, picture in (("before", conclusion.before_map), ("after", conclusion.after_map)):
-            path = self.directory / f"{name}.exr"
-            write_maps(path, {"value": picture}, units={"value": units.get(name, "")}, metadata=shared)
+            write_maps(
+                directory / f"{name}.exr", {"value": picture}, units={"value": units.get(name, "")}, metadata=shared
+            )
         if conclusion.maps:
-            write_maps(self.directory / "maps.exr", conclusion.maps, units=units, metadata=shared)
-        write_figures(self.directory, conclusion.figures)
-        write_json(self.directory / "result.json", result)
+            write_maps(directory / "maps.exr", conclusion.maps, units=units, metadata=shared)
 
     def finish(
         self, status: str, *, render: Callable[[Path], bytes] | None, error: Mapping[str, Any] | None = None

@@ -23,6 +23,7 @@ from holocal.records.files import make_directory, read_json, read_toml, storage_
 from holocal.records.manifest import read_manifest, require_intact
 from holocal.records.maps import Maps, read_maps
 from holocal.records.rig import digest
+from holocal.records.run_files import part_entry, parts_of
 
 SCHEMA = 1
 ENTRY_FILES = ("identity.json", "config.toml", "result.json", "maps.exr")
@@ -93,11 +94,15 @@ def load(identity: Mapping[str, Any]) -> dict[str, Accepted]:
     return loaded
 
 
-def read_run(run: Path) -> Accepted:
-    """Return a finished run as if it were accepted (``--corrections RUN``), after checking its files."""
+def read_run(run: Path) -> dict[str, Accepted]:
+    """Return what a finished run found as if it were accepted (``--corrections RUN``), after checking its files."""
     _check_complete(run)
-    result = read_json(run / "result.json")
-    return Accepted(str(result["procedure"]), run.name, "", result, read_maps(run / "maps.exr"))
+    found = {}
+    for part in parts_of(run).values() or (run,):
+        result = read_json(part / "result.json")
+        procedure = str(result["procedure"])
+        found[procedure] = Accepted(procedure, run.name, "", result, read_maps(part / "maps.exr"))
+    return found
 
 
 def check_identity(measured_on: Mapping[str, Any], rig: Mapping[str, Any], *, subject: str, fix: str) -> None:
@@ -166,9 +171,12 @@ def accept(run: Path, identity: Mapping[str, Any]) -> dict[str, Any]:
         for name, entry in state.get("accepted", {}).items()
         if read_json(directory / "entries" / entry / "identity.json") == dict(identity)
     }
-    _check_corrections(run.name, procedure, result.get("corrections", {}), accepted)
-    _copy_entry(run, directory)
-    return _advance(directory, state, {**accepted, procedure: run.name})
+    parts = parts_of(run) or {procedure: run}
+    _check_corrections(run.name, set(parts), result.get("corrections", {}), accepted)
+    entries = {name: part.name if part == run else part_entry(run.name, name) for name, part in parts.items()}
+    for name, part in parts.items():
+        _copy_entry(part, directory, entries[name])
+    return _advance(directory, state, {**accepted, **entries})
 
 
 def rollback(rig: str) -> dict[str, Any]:
@@ -197,15 +205,15 @@ def _check_complete(run: Path) -> None:
 
 
 def _check_corrections(
-    run: str, procedure: str, measured_under: Mapping[str, str], accepted: Mapping[str, str]
+    run: str, procedures: set[str], measured_under: Mapping[str, str], accepted: Mapping[str, str]
 ) -> None:
-    for name in sorted({*measured_under, *accepted} - {procedure}):
+    for name in sorted({*measured_under, *accepted} - procedures):
         if measured_under.get(name) != accepted.get(name):
             raise RefusedError(
                 f"{run} was measured under {name} = {measured_under.get(name) or 'none'}; "
                 f"in force is {accepted.get(name) or 'none'}.",
                 why="Corrections are measured on top of each other.",
-                fix=f"Measure again under what is in force: `holocal run {procedure}`.",
+                fix=f"Measure again under what is in force: `holocal run {' and '.join(sorted(procedures))}`.",
                 measured=measured_under.get(name),
                 limit=accepted.get(name),
                 code="other-corrections",
@@ -235,16 +243,16 @@ def _is_name(name: Any) -> bool:
     return isinstance(name, str) and name not in ("", ".", "..") and not set(name) & set("/\\\0")
 
 
-def _copy_entry(run: Path, directory: Path) -> None:
-    entry = make_directory(directory / "entries") / run.name
+def _copy_entry(run: Path, directory: Path, name: str) -> None:
+    entry = make_directory(directory / "entries") / name
     if entry.is_dir():
         return
-    partial = entry.with_name(f".{run.name}.{os.getpid()}.tmp")
+    partial = entry.with_name(f".{name}.{os.getpid()}.tmp")
     try:
         partial.mkdir()
-        for name in ENTRY_FILES:
-            shutil.copyfile(run / name, partial / name)
-            sync(partial / name)
+        for file in ENTRY_FILES:
+            shutil.copyfile(run / file, partial / file)
+            sync(partial / file)
         partial.rename(entry)
         sync(entry.parent)
     except OSError as error:

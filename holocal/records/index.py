@@ -20,7 +20,7 @@ from holocal.errors import StorageError
 from holocal.records.calibration import home
 from holocal.records.files import json_ready, make_directory, read_json, write_json
 from holocal.records.rig import digest
-from holocal.records.run_files import RunSummary, is_run, stamp_of, summary_of
+from holocal.records.run_files import RunSummary, is_run, part_summaries, stamp_of, summary_of
 
 SCHEMA = 1
 NAME = "index.sqlite"
@@ -127,21 +127,27 @@ def _filled(connection: sqlite3.Connection, roots: Iterable[Path]) -> sqlite3.Co
 
 def _update(connection: sqlite3.Connection, roots: Iterable[Path]) -> None:
     """Bring the rows into step: only runs whose files changed are read."""
-    there = {str(run): (run, accepted) for run, accepted in _runs_in(roots)}
+    there = {str(run): (run, accepted, stamp_of(run)) for run, accepted in _runs_in(roots)}
     known = {str(row["path"]): str(row["stamp"]) for row in connection.execute("SELECT path, stamp FROM run")}
-    rows = []
-    for path, (run, accepted) in there.items():
-        stamp = stamp_of(run)
-        if known.get(path) != stamp:
-            said = asdict(summary_of(run, accepted=accepted))
-            said["result"] = json.dumps(json_ready(said["result"]))
-            rows.append((*(said[name] for name in COLUMNS), stamp))
-    gone = [(path,) for path in known if path not in there]
+    rows, changed = [], []
+    for path, (run, accepted, stamp) in there.items():
+        if known.get(path) == stamp:
+            continue
+        changed.append((path, f"{path}/%"))
+        summary = summary_of(run, accepted=accepted)
+        rows += [_row(one, stamp) for one in (summary, *part_summaries(run, summary))]
+    gone = [(path, f"{path}/%") for path in known if path not in there and str(Path(path).parent) not in there]
     if rows or gone:
         marks = ", ".join("?" * (len(COLUMNS) + 1))
         with connection:
-            connection.executemany("DELETE FROM run WHERE path = ?", gone)
+            connection.executemany("DELETE FROM run WHERE path = ? OR path LIKE ?", gone + changed)
             connection.executemany(f"INSERT OR REPLACE INTO run VALUES ({marks})", rows)
+
+
+def _row(summary: RunSummary, stamp: str) -> tuple[str, ...]:
+    said = asdict(summary)
+    said["result"] = json.dumps(json_ready(said["result"]))
+    return (*(said[name] for name in COLUMNS), stamp)
 
 
 def _runs_in(roots: Iterable[Path]) -> Iterator[tuple[Path, bool]]:

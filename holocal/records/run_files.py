@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -80,6 +80,15 @@ def summary_of(run: Path, *, accepted: bool = False) -> RunSummary:
     )
 
 
+def part_summaries(run: Path, summary: RunSummary) -> list[RunSummary]:
+    """Return what each procedure of a run of several says of itself, under the name that it is accepted by."""
+    found = []
+    for name, part in parts_of(run).items():
+        own = summary_of(part)
+        found.append(replace(own, name=part_entry(run.name, name), utc=summary.utc, status=summary.status))
+    return found
+
+
 def utc_of(name: str) -> str:
     """Return when a run was begun by its name, ISO 8601; "" for another name."""
     time = begun(name)
@@ -97,6 +106,19 @@ def begun(name: str) -> datetime | None:
 def _printable(value: Any) -> str:
     """Return a text that any file and terminal takes: half a surrogate pair is a JSON string too."""
     return "".join(letter if letter.isprintable() else "?" for letter in str(value))
+
+
+def part_entry(run: str, part: str) -> str:
+    """Return the name that one procedure's result of a run of several has among accepted runs."""
+    return f"{run}.{part}"
+
+
+def parts_of(run: Path) -> dict[str, Path]:
+    """Return the directories of the results of a run of several procedures, by their procedures; {} of another run."""
+    listed = _json(run / "result.json").get("parts")
+    names = [name for name in listed if isinstance(name, str)] if isinstance(listed, list) else []
+    found = {name: run / name for name in names if name.isidentifier()}
+    return {name: path for name, path in found.items() if path.is_dir() and not path.is_symlink()}
 
 
 def _procedure_in(name: str) -> str:

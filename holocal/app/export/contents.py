@@ -1,7 +1,8 @@
 """What a run holds, as named arrays: maps, the pictures before and after, tables, numbers, the report's data.
 
 A name is a path: ``maps/valid``, ``result/after/rms_px``, ``steps/value``. Every array has a unit and, for each of its
-dimensions, the name of the array that it runs along. A list of records is a column per key; None is NaN; a text is left
+dimensions, the name of the array that it runs along. What belongs to one procedure of a run of several begins with its
+name: ``response/maps/correction.phase_rad``. A list of records is a column per key; None is NaN; a text is left
 to the documents, which hold the run's own files.
 """
 
@@ -22,6 +23,7 @@ from holocal.records.files import dump_json, read_json
 from holocal.records.manifest import require_intact
 from holocal.records.maps import Maps, read_maps
 from holocal.records.reading import reading
+from holocal.records.run_files import parts_of
 from holocal.units import DEGREE, unit_of
 
 SCHEMA = 1
@@ -59,11 +61,16 @@ def contents_of(run: Path) -> Contents:
             code="no-result",
         )
     result = read_json(run / "result.json")
-    images = {name: read_maps(run / f"{name}.exr") for name in IMAGES if (run / f"{name}.exr").is_file()}
+    images: dict[str, Maps] = {}
     quantities: dict[str, Quantity] = {}
+    for prefix, directory in {"": run, **{f"{name}/": part for name, part in parts_of(run).items()}}.items():
+        images |= {
+            f"{prefix}{name}": read_maps(path) for name in IMAGES if (path := directory / f"{name}.exr").is_file()
+        }
+        tree = _of_tree(read_json(directory / "result.json"), "")
+        quantities |= {f"{prefix}result/{name}": found for name, found in tree.items()}
     for name, image in images.items():
         quantities |= _of_image(name, image)
-    quantities |= {f"result/{name}": found for name, found in _of_tree(result, "").items()}
     quantities |= _of_steps(run) | _of_figures(run)
     about = {"schema": SCHEMA, "run": run.name} | {
         key: result.get(key) for key in ("procedure", "rig", "targets_met", "sentence", "seed", "corrections")
@@ -82,7 +89,8 @@ def index_of(contents: Contents) -> str:
 
 def _documents(run: Path) -> dict[str, str]:
     found = {}
-    for name in DOCUMENTS:
+    parts = [f"{name}/result.json" for name in parts_of(run)]
+    for name in (*DOCUMENTS, *parts):
         if (run / name).is_file():
             with reading(run / name):
                 found[name] = (run / name).read_text(encoding="utf-8")
