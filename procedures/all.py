@@ -222,7 +222,7 @@ def _in_force(state: State) -> dict[str, Accepted]:
     """Return what the stages before found, as if it were accepted; what missed its targets is left out."""
     found = {}
     for stage, one in zip(STAGES, state.done, strict=False):
-        if one.targets_met:
+        if one.targets_met and one.extra.get("correction") != "none":
             maps = {name: np.asarray(values, np.float32) for name, values in one.maps.items()}
             metadata = {"extent_deg": one.extent_deg, **one.map_metadata}
             found[stage.name] = Accepted(stage.name, "", "", one.extra, Maps(maps, metadata))

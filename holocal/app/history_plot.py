@@ -29,8 +29,9 @@ def write_plot(history: History, path: Path) -> None:
     if path.suffix.lower() != ".png":
         raise InputError(f"{path} is not named .png.", fix="Use --plot FILE.png.")
     panels: dict[str, list[Line]] = {}
+    whole = {line.run.name.partition(".")[0] for line in history.lines if "." in line.run.name}  # drawn by their parts
     for line in history.lines:
-        if line.main is not None and line.run.utc:
+        if line.main is not None and line.run.utc and line.run.name not in whole:
             panels.setdefault(line.run.procedure, []).append(line)
     if not panels:
         raise InputError(f"no run of {history.rig} has a number to draw.", fix="`holocal history` lists what there is.")

@@ -277,7 +277,7 @@ class _Loop:
             if "truth" in result:
                 said["truth"] = result["truth"].get(name, {})
             self.record.part(name, part, dict(json_ready(said)))
-            if part.targets_met:
+            if part.targets_met and part.extra.get("correction") != "none":
                 corrections[name] = part_entry(self.record.directory.name, name)
 
     def _drift(self) -> Drift | None:

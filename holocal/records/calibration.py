@@ -142,22 +142,9 @@ def accept(run: Path, identity: Mapping[str, Any]) -> dict[str, Any]:
     _check_complete(run)
     result = read_json(run / "result.json")
     procedure = str(result["procedure"])
-    if result.get("targets_met") is not True:
-        raise RefusedError(
-            f"{run.name} did not meet its targets: {result.get('sentence', 'see its report')}",
-            why="A calibration that missed its target is evidence, not a calibration.",
-            fix=f"Run it again: `holocal run {procedure} --rig {result.get('rig')}`.",
-            measured=result.get("after"),
-            limit=result.get("targets"),
-            code="targets-missed",
-        )
-    if result.get("correction") == "none":
-        raise RefusedError(
-            f"{run.name} corrects nothing: {result.get('sentence', 'see its report')}",
-            why="It only shows the bench as it is.",
-            fix=f"Measure a correction: `holocal run {procedure} --rig {result.get('rig')}`.",
-            code="no-correction",
-        )
+    parts = parts_of(run) or {procedure: run}
+    for name, part in {procedure: run, **parts}.items():
+        _require_correction(run.name, name, read_json(part / "result.json"))
     check_identity(
         read_json(run / "identity.json"),
         identity,
@@ -171,7 +158,6 @@ def accept(run: Path, identity: Mapping[str, Any]) -> dict[str, Any]:
         for name, entry in state.get("accepted", {}).items()
         if read_json(directory / "entries" / entry / "identity.json") == dict(identity)
     }
-    parts = parts_of(run) or {procedure: run}
     _check_corrections(run.name, set(parts), result.get("corrections", {}), accepted)
     entries = {name: part.name if part == run else part_entry(run.name, name) for name, part in parts.items()}
     for name, part in parts.items():
@@ -187,6 +173,26 @@ def rollback(rig: str) -> dict[str, Any]:
         raise RefusedError(f"rig {rig} has no accepted calibration in {directory}.", fix="There is nothing to undo.")
     write_json(directory / "current.json", {"schema": SCHEMA, "state": state["before"]})
     return _state(directory)
+
+
+def _require_correction(run: str, procedure: str, result: Mapping[str, Any]) -> None:
+    """Raise `RefusedError` unless a result met its targets and corrects something."""
+    if result.get("targets_met") is not True:
+        raise RefusedError(
+            f"{run} did not meet its targets: {result.get('sentence', 'see its report')}",
+            why="A calibration that missed its target is evidence, not a calibration.",
+            fix=f"Run it again: `holocal run {procedure} --rig {result.get('rig')}`.",
+            measured=result.get("after"),
+            limit=result.get("targets"),
+            code="targets-missed",
+        )
+    if result.get("correction") == "none":
+        raise RefusedError(
+            f"{run} corrects nothing: {result.get('sentence', 'see its report')}",
+            why="It only shows the bench as it is.",
+            fix=f"Measure a correction: `holocal run {procedure} --rig {result.get('rig')}`.",
+            code="no-correction",
+        )
 
 
 def _check_complete(run: Path) -> None:

@@ -26,6 +26,7 @@ class Settings(BaseModel):
     """Of a stage that only counts."""
 
     good: bool = True
+    corrects: bool = True
     device: str = "cpu"
 
 
@@ -80,7 +81,7 @@ class Stage:
             after_map=picture,
             extent_deg=(-1.0, 1.0, -1.0, 1.0),
             sigma={"after": {"rms": 0.01}},
-            extra={"told_of": list(state.told_of)},
+            extra={"told_of": list(state.told_of), "correction": "all" if state.parameters.corrects else "none"},
         )
 
     def shot(self, seed, number):
@@ -159,6 +160,15 @@ def test_a_stage_that_missed_its_targets_is_not_built_upon_and_the_run_is_not_me
     second = json.loads((done.directory / "second" / "result.json").read_text())
     assert second["told_of"] == [] and second["corrections"] == {}
     with pytest.raises(RefusedError, match="did not meet"):
+        calibration.accept(done.directory, identity(open_rig(load_rig("lab-bench", {})).facts()))
+    assert calibration.in_force("lab-bench") == {}
+
+
+def test_a_stage_that_corrects_nothing_is_neither_built_upon_nor_accepted(home):
+    done = go(home / "runs", first={"corrects": False})
+    second = json.loads((done.directory / "second" / "result.json").read_text())
+    assert second["told_of"] == []
+    with pytest.raises(RefusedError, match="corrects nothing"):
         calibration.accept(done.directory, identity(open_rig(load_rig("lab-bench", {})).facts()))
     assert calibration.in_force("lab-bench") == {}
 
