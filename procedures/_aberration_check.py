@@ -30,8 +30,12 @@ def remeasured(
     mode, accepted = ModelMode(), calibration["aberration"]
     state = mode.start(facts, calibration, parameters.model_copy(update={"mode": "model"}), seed)
     coefficients = np.asarray(accepted.result["field"]["coefficients_rad"], np.float64)
-    state = told(replace(state, coefficients_rad=coefficients), reference)
-    state = replace(state, exposure_s=state.guess_s)
+    state = replace(state, coefficients_rad=coefficients, reference=reference)
+    if seen := accepted.result.get("verified_with"):
+        state = replace(state, next_gain=np.asarray(seen["gains"], np.float64), exposure_s=float(seen["exposure_s"]))
+    else:  # another mode was accepted: brightness is shared out anew
+        state = told(state, reference)
+        state = replace(state, exposure_s=state.guess_s)
     fresh = verified(state, (yield from taken(mode.verification(state))))
     array, found = array_of(state), estimate_of(fresh)
     believed, before = int(found.valid.sum()), int(accepted.result["zones_believed"])

@@ -180,6 +180,7 @@ def conclusion(state: State, fresh: State) -> Conclusion:
             "left_out": _left_out(array, found),
             "sigma_widened_by": wider,
             "exposures_s": [*state.exposures_s.tolist(), *fresh.exposures_s.tolist()],
+            "verified_with": {"gains": state.next_gain.tolist(), "exposure_s": float(fresh.exposures_s[0])},
             "zones_lit": lit,
             "zones_believed": believed,
             "rig_facts": geometry_of(state),
