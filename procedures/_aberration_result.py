@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from hashlib import sha256
 from typing import TYPE_CHECKING, Any
@@ -124,8 +125,8 @@ def conclusion(state: State, fresh: State) -> Conclusion:
     left = check.field.zones + correction
     sharp = (sharpness(state, found, 0.0), sharpness(fresh, check, 0.0))
     wider = retest(array, found, check)
-    before = _side(array, found, found.field.zones, wider**2 * found.field.zone_covariance, sharp[0], chosen.noll)
-    after = _side(array, check, left, wider**2 * check.field.zone_covariance, sharp[1], chosen.noll)
+    before = side_of(array, found, found.field.zones, wider**2 * found.field.zone_covariance, sharp[0], chosen.noll)
+    after = side_of(array, check, left, wider**2 * check.field.zone_covariance, sharp[1], chosen.noll)
     median, worst = after["median"]["wavefront_rms_rad"], after["worst"]["wavefront_rms_rad"]
     believed = int(check.valid.sum())
     lit = int(array.on.sum())
@@ -164,6 +165,7 @@ def conclusion(state: State, fresh: State) -> Conclusion:
         map_units=units | {"before": "counts", "after": "counts"},
         map_metadata={"wavelength_nm": chosen.wavelength_nm},
         extent_deg=extent,
+        sigma={"before": sigmas_of(before), "after": sigmas_of(after)},
         extra={
             "mode": "model",
             "wavelength_nm": chosen.wavelength_nm,
@@ -178,6 +180,7 @@ def conclusion(state: State, fresh: State) -> Conclusion:
             "left_out": _left_out(array, found),
             "sigma_widened_by": wider,
             "exposures_s": [*state.exposures_s.tolist(), *fresh.exposures_s.tolist()],
+            "verified_with": {"gains": state.next_gain.tolist(), "exposure_s": float(fresh.exposures_s[0])},
             "zones_lit": lit,
             "zones_believed": believed,
             "rig_facts": geometry_of(state),
@@ -216,7 +219,7 @@ def geometry_of(state: State) -> dict[str, float]:
     }
 
 
-def _side(
+def side_of(
     array: SpotArray, found: Estimate, means: Array, covariance: Array, sharp: Array, noll: tuple[int, ...]
 ) -> dict[str, Any]:
     """Return `before` or `after`: every zone's numbers, and the median and the worst of those believed."""
@@ -259,6 +262,21 @@ def summarised(zones: list[dict[str, Any]]) -> dict[str, Any]:
         if rms
         else nothing,
         "zones": zones,
+    }
+
+
+def sigmas_of(side: Mapping[str, Any]) -> dict[str, float]:
+    """Return the standard errors of a side's median and worst wavefront.
+
+    The zones share their errors, so the median is known no better than a zone.
+    """
+    valid = [zone for zone in side["zones"] if zone["valid"] and zone["wavefront_sigma_rad"] is not None]
+    if not valid:
+        return {}
+    worst = max(valid, key=lambda zone: float(zone["wavefront_rms_rad"]))
+    return {
+        "median_wavefront_rms_rad": float(np.median([zone["wavefront_sigma_rad"] for zone in valid])),
+        "worst_wavefront_rms_rad": float(worst["wavefront_sigma_rad"]),
     }
 
 

@@ -16,7 +16,7 @@ from holocal.loop.devices import Frame
 from holocal.loop.procedure import Conclusion
 from procedures._aberration_light import array_of, correction_of, dark_level, half_tan_of
 from procedures._aberration_pictures import extent_of, figures_of, maps_of, mosaic
-from procedures._aberration_result import geometry_of, shown_rms, shown_sigma, summarised
+from procedures._aberration_result import geometry_of, shown_rms, shown_sigma, sigmas_of, summarised
 from procedures._aberration_seen import ZoneWindows
 from procedures._aberration_truth import left_of, residual_of
 from procedures._aberration_windows import cut, cut_picture, lit_pupils, noise_of, places_listed, sharpness
@@ -158,6 +158,7 @@ def conclusion(state: State, frames: Sequence[Frame]) -> Conclusion:
         map_units=units | {"before": "counts", "after": "counts"},
         map_metadata={"wavelength_nm": chosen.wavelength_nm},
         extent_deg=extent,
+        sigma={"before": sigmas_of(before), "after": sigmas_of(after)},
         extra={
             "mode": "search",
             "wavelength_nm": chosen.wavelength_nm,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import replace
+from hashlib import sha256
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -38,6 +39,7 @@ ROUGHEST_PX = 1.0  # of a map, at spots held out: a bench's own leaves below 0.1
 EDGE_PX = 4.0  # of the picture: a spot nearer is not asked for
 _MADE: OrderedDict[str, SpotArray] = OrderedDict()
 _KEPT = 3
+_MEASURED: dict[str, list[Places]] = {}
 
 
 def array_of(state: State, grid: int) -> SpotArray:
@@ -116,7 +118,17 @@ def measured(state: State) -> tuple[Array, Places]:
 
 
 def _places_of_grids(state: State) -> list[Places]:
-    """Return where the camera sees the spots of every grid that was measured."""
+    """Return where the camera sees the spots of every grid that was measured; the last are kept, as several ask."""
+    said = (state.facts, state.parameters, state.exposures_s.tolist(), state.grids.tolist(), state.second_tan.tolist())
+    key = sha256(repr(said).encode())
+    key.update(np.ascontiguousarray(state.pictures).tobytes())
+    if key.hexdigest() not in _MEASURED:
+        _MEASURED.clear()
+        _MEASURED[key.hexdigest()] = _seen_in_grids(state)
+    return _MEASURED[key.hexdigest()]
+
+
+def _seen_in_grids(state: State) -> list[Places]:
     pairs = [np.flatnonzero(state.grids == grid) for grid in range(int(state.grids.max()) + 1)]
     return [
         places_of_pair(

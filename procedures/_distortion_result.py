@@ -15,6 +15,7 @@ from holocal.loop.devices import Frame
 from holocal.loop.procedure import Conclusion, Figure
 from holocal.records.facts import CameraFacts
 from holocal.units import DEGREE
+from procedures._bench_light import PARAMETERS
 from procedures._distortion_map import array_of, corners_of, map_of, measured, moved
 from procedures._distortion_points import Places, dark_subtracted, places_of_pair
 
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Maps = dict[str, NDArray[np.float32]]
 
+FEWEST_SEEN = 0.8  # of the verification's spots
 GRID = 150  # of the exported maps, along the longer side: a bilinear reading of them is off by 0.001 px
 
 
@@ -40,12 +42,12 @@ def conclusion(state: State, frames: Sequence[Frame]) -> Conclusion:
     )  # fmt: skip
     check = moved(state, 2, check)
     expected = array.on
-    before = _side(
+    before = side_of(
         places.ideal_px - sent, places.found, int(np.concatenate([array_of(state, g).on for g in _grids(state)]).sum())
     )
-    after = _side(check.ideal_px - wanted, check.found, int(expected.sum()))
+    after = side_of(check.ideal_px - wanted, check.found, int(expected.sum()))
     met = after["rms_px"] <= chosen.target_rms_px and after["max_px"] <= chosen.target_max_px
-    met = met and after["points_found"] >= 0.8 * after["points_expected"]
+    met = met and after["points_found"] >= FEWEST_SEEN * after["points_expected"]
     corners = corners_of(sent, places)
     left = np.linalg.norm((corners(sent) - places.ideal_px)[places.found], axis=1)
     sentence = (
@@ -78,8 +80,10 @@ def conclusion(state: State, frames: Sequence[Frame]) -> Conclusion:
         map_units=units | {"before": "counts", "after": "counts"},
         map_metadata={"pixel_tan": pixel_tan(camera)},
         extent_deg=extent,
+        sigma={"before": sigma_of(places.ideal_px - sent, places), "after": sigma_of(check.ideal_px - wanted, check)},
         extra={
             "mode": chosen.mode,
+            "light_model": dict(zip(PARAMETERS, state.light_values.tolist(), strict=False)),
             "map": _model(found),
             "corners_only": {"rms_px": float(np.sqrt(np.mean(left**2))), "max_px": float(left.max())},
             "centroid_sigma_px": float(np.median(check.sigma_px[check.found])) if check.found.any() else None,
@@ -119,7 +123,7 @@ def _grids(state: State) -> range:
     return range(int(state.grids.max()) + 1)
 
 
-def _side(off: Array, found: NDArray[np.bool_], expected: int) -> dict[str, Any]:
+def side_of(off: Array, found: NDArray[np.bool_], expected: int) -> dict[str, Any]:
     """Return `before` or `after`: distances (n, 2) of the spots found."""
     distance = np.linalg.norm(off[found], axis=1)
     if not len(distance):
@@ -130,6 +134,17 @@ def _side(off: Array, found: NDArray[np.bool_], expected: int) -> dict[str, Any]
         "points_found": len(distance),
         "points_expected": expected,
     }
+
+
+def sigma_of(off: Array, places: Places) -> dict[str, float]:
+    """Return the standard errors of a side's numbers, from those of its spots in each coordinate."""
+    distance, sigma = np.linalg.norm(off, axis=1)[places.found], places.sigma_px[places.found]
+    if not len(distance):
+        return {}
+    # The spots are a sample of the field: of n distances the rms is known to 1 / (2 sqrt(n)) of itself.
+    rms, count = float(np.sqrt(np.mean(distance**2))), len(distance)
+    noise = float(np.sqrt(np.mean(sigma**2) / count))
+    return {"rms_px": float(np.hypot(rms / (2 * np.sqrt(count)), noise)), "max_px": float(sigma[np.argmax(distance)])}
 
 
 def _maps(state: State, found: SmoothMap | FourCorners) -> tuple[Maps, dict[str, str]]:

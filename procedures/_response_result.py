@@ -25,18 +25,41 @@ SHOWN_PIXELS = 3
 
 
 @dataclass(frozen=True)
-class Verified:
-    """The table against phases measured afresh at `levels`: `difference_rad`, its rms and what noise adds to that.
-
-    `scale` is the factor between the phases seen through the finer rows and the table, `scale_sigma` its error;
-    `crosstalk_rad` what the table is wrong by, rms, if that factor comes from neighbours that blur each other.
-    """
+class TableError:
+    """A table against phases measured afresh at `levels`: `difference_rad`, its rms and what noise adds to that."""
 
     levels: NDArray[np.int64]
     difference_rad: Array
     sigma_rad: Array
     rms_rad: float
     noise_rad: float
+
+    @property
+    def rms_sigma_rad(self) -> float:
+        """The standard error of `rms_rad`: that of the rms of so many differences, one piston taken out."""
+        return float(max(self.rms_rad, self.noise_rad) / np.sqrt(2 * max(len(self.levels) - 1, 1)))
+
+
+def error_at(levels: NDArray[np.int64], table_rad: Array, measured_rad: Array, covariance: Array) -> TableError:
+    """Return how far a table is from phases that were measured at some of its levels."""
+    n = len(levels)
+    centre = np.eye(n) - 1 / n
+    sigma = np.sqrt(np.diag(centre @ covariance @ centre))
+    difference = phase_difference(table_rad[levels], measured_rad)
+    # One piston was fitted to n differences, hence n - 1.
+    found, noise = (float(np.sqrt(np.sum(values**2) / (n - 1))) for values in (difference, sigma))
+    return TableError(levels, difference, sigma, found, noise)
+
+
+@dataclass(frozen=True)
+class Verified:
+    """The verification: `error` of the table at levels that it was not made from.
+
+    `scale` is the factor between the phases seen through the finer rows and the table, `scale_sigma` its error;
+    `crosstalk_rad` what the table is wrong by, rms, if that factor comes from neighbours that blur each other.
+    """
+
+    error: TableError
     scale: float
     scale_sigma: float
     crosstalk_rad: float
@@ -50,25 +73,20 @@ def verified(state: State, fresh: Fringes) -> Verified:
     if np.count_nonzero(unseen) < 3:  # a panel of few levels: all were measured, and are now measured again
         unseen = np.ones(len(fresh.levels), np.bool_)
     levels, covariance = fresh.levels[unseen], fresh.covariance[np.ix_(unseen, unseen)]
-    n = len(levels)
-    centre = np.eye(n) - 1 / n
-    sigma = np.sqrt(np.diag(centre @ covariance @ centre))
     if not (fresh.valid and state.table.valid):
-        unknown = np.full(n, UNKNOWN_RAD)
-        return Verified(levels, np.zeros(n), unknown, UNKNOWN_RAD, UNKNOWN_RAD, 1.0, float("inf"), 0.0, False)
+        unknown = np.full(len(levels), UNKNOWN_RAD)
+        nothing = TableError(levels, np.zeros(len(levels)), unknown, UNKNOWN_RAD, UNKNOWN_RAD)
+        return Verified(nothing, 1.0, float("inf"), 0.0, False)
     measured = fresh.phase_rad[unseen] * (-1.0 if state.rising is False else 1.0)
+    error = error_at(levels, state.table.phase_rad, measured, covariance)
     expected = state.table.phase_rad[levels]
-    difference = phase_difference(expected, measured)
-    # One piston was fitted to n differences, hence n - 1.
-    found = float(np.sqrt(np.sum(difference**2) / (n - 1)))
-    noise = float(np.sqrt(np.sum(sigma**2) / (n - 1)))
     x = expected - expected.mean()
     both = covariance + state.table.covariance[np.ix_(levels, levels)]
     scale = float(x @ (measured - measured.mean()) / (x @ x))
     scale_sigma = float(np.sqrt(x @ both @ x) / (x @ x))
     certain = 1 - scale > CERTAIN * scale_sigma
     crosstalk = PER_CROSSTALK * (1 - scale) * float(np.std(state.table.phase_rad)) if certain else 0.0
-    return Verified(levels, difference, sigma, found, noise, scale, scale_sigma, crosstalk, True)
+    return Verified(error, scale, scale_sigma, crosstalk, True)
 
 
 def conclusion(state: State, fresh: Fringes) -> Conclusion:
@@ -78,10 +96,11 @@ def conclusion(state: State, fresh: Fringes) -> Conclusion:
     chosen, table, check = state.parameters, state.table, verified(state, fresh)
     before = rms(phase_difference(state.in_force, table.phase_rad)) if table.valid else UNKNOWN_RAD
     blurred = check.crosstalk_rad > chosen.target_rad
-    met = check.valid and state.sign_known and check.rms_rad <= chosen.target_rad and not blurred
+    met = check.valid and state.sign_known and check.error.rms_rad <= chosen.target_rad and not blurred
+    error = check.error
     sentence = (
-        f"phase error {before:.3f} -> {check.rms_rad:.4f} rad rms (target {chosen.target_rad:g}; the check's own noise "
-        f"is {check.noise_rad:.4f}), range {table.range_rad / np.pi:.3f} pi, from {len(state.fringes.levels)} of "
+        f"phase error {before:.3f} -> {error.rms_rad:.4f} rad rms (target {chosen.target_rad:g}; the check's own noise "
+        f"is {error.noise_rad:.4f}), range {table.range_rad / np.pi:.3f} pi, from {len(state.fringes.levels)} of "
         f"{state.count} levels: {'met' if met else 'not met'}"
     )
     if not check.valid:
@@ -100,7 +119,7 @@ def conclusion(state: State, fresh: Fringes) -> Conclusion:
     phase = table.phase_rad.astype(np.float32)[None]
     return Conclusion(
         before={"phase_error_rms_rad": before, "range_rad": float(state.in_force[-1] - state.in_force[0])},
-        after={"phase_error_rms_rad": check.rms_rad, "range_rad": table.range_rad if table.valid else None},
+        after={"phase_error_rms_rad": error.rms_rad, "range_rad": table.range_rad if table.valid else None},
         targets={"phase_error_rms_rad": chosen.target_rad},
         targets_met=met,
         sentence=sentence,
@@ -113,9 +132,26 @@ def conclusion(state: State, fresh: Fringes) -> Conclusion:
             "before": "counts/s",
             "after": "counts/s",
         },
+        map_metadata={"axes": ("row", "level")},
+        sigma=_sigma(state, check),
         extra=_extra(state, check),
         figures=_figures(state, check, pictures),
     )
+
+
+def _sigma(state: State, check: Verified) -> dict[str, dict[str, float]]:
+    table = state.table
+    if table is None or not (table.valid and check.valid):
+        return {}
+    ends = np.zeros(state.count)
+    ends[[0, -1]] = -1, 1
+    return {
+        "before": {"phase_error_rms_rad": table.sigma_rms_rad},
+        "after": {
+            "phase_error_rms_rad": check.error.rms_sigma_rad,
+            "range_rad": float(np.sqrt(np.maximum(ends @ table.covariance @ ends, 0.0))),
+        },
+    }
 
 
 def _extra(state: State, check: Verified) -> dict[str, Any]:
@@ -137,9 +173,9 @@ def _extra(state: State, check: Verified) -> dict[str, Any]:
             "reason": fringes.reason,
         },
         "verification": {
-            "levels": check.levels.tolist(),
-            "difference_rad": check.difference_rad.tolist(),
-            "noise_rms_rad": check.noise_rad,
+            "levels": check.error.levels.tolist(),
+            "difference_rad": check.error.difference_rad.tolist(),
+            "noise_rms_rad": check.error.noise_rad,
         },
         "crosstalk": {
             "scale": check.scale,
@@ -159,7 +195,7 @@ def _figures(state: State, check: Verified, pictures: NDArray[np.float32]) -> tu
     """Return the report's pictures: the curve, its residual, the verification, some fringes, the picture."""
     assert state.table is not None
     assert state.fringes is not None
-    table, fringes = state.table, state.fringes
+    table, fringes, error = state.table, state.fringes, check.error
     levels = np.arange(state.count)
     sign = -1.0 if state.rising is False else 1.0
     residual = phase_difference(sign * fringes.phase_rad, table.phase_rad[fringes.levels])
@@ -192,7 +228,11 @@ def _figures(state: State, check: Verified, pictures: NDArray[np.float32]) -> tu
             "verification",
             "The table against levels that it was not made from",
             "curve",
-            {"x": check.levels, "table_less_measured": check.difference_rad, "sigma": check.sigma_rad},
+            {
+                "x": error.levels,
+                "table_less_measured": error.difference_rad,
+                "sigma": error.sigma_rad,
+            },
             "rad",
             "x: level. Another pattern, other pixels, fresh frames; the band is the noise of the check.",
             target=state.parameters.target_rad,

@@ -99,12 +99,12 @@ def conclusion(state: State, verified: Image) -> Conclusion:
         after_map=last,
         map_units={"brightness": "1", "brightness_sigma": "1", "correction.intensity_weight": "1", "valid": "1"},
         extent_deg=extent,
+        sigma={
+            "before": {"nonuniformity_rms": before.rms_sigma, "nonuniformity_9pt": before.nine_point_sigma},
+            "after": {"nonuniformity_rms": after.rms_sigma, "nonuniformity_9pt": after.nine_point_sigma},
+        },
         extra={
             "estimator": chosen.estimator,
-            "sigma": {
-                "before": {"nonuniformity_rms": before.rms_sigma, "nonuniformity_9pt": before.nine_point_sigma},
-                "after": {"nonuniformity_rms": after.rms_sigma, "nonuniformity_9pt": after.nine_point_sigma},
-            },
             "thesis": beside_thesis(state, verified, chosen.block_px),
             "response_exponent": {"mean": state.gamma, "sigma": state.gamma_sigma},
             "map_sigma_rms": state.map_sigma,

@@ -13,13 +13,13 @@ All three find exposure and spots with the same first frame.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping
 from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from holocal.loop.devices import Frame
-from holocal.loop.procedure import Conclusion, Judgement, Plan, Shot
+from holocal.loop.procedure import Conclusion, Judgement, Plan, Remeasured, Shot
 from holocal.loop.reference import Reference
 from holocal.records.facts import RigFacts
 from procedures._aberration_model import ModelMode
@@ -108,6 +108,19 @@ class Aberration:
     def conclude(self, state: Any, frames: tuple[Frame, ...]) -> Conclusion:
         """Return the result; "after" is measured on the verification's frames only."""
         return _mode_of(state).conclude(state, frames)
+
+    def remeasure(
+        self,
+        facts: RigFacts,
+        calibration: Mapping[str, Any],
+        parameters: Parameters,
+        reference: Reference,
+        seed: int,
+    ) -> Generator[Shot, Frame, Remeasured]:
+        """Yield the frames that measure the accepted correction; return what it leaves."""
+        from procedures._aberration_check import remeasured
+
+        return remeasured(facts, calibration, parameters, reference, seed)
 
     def against_truth(self, conclusion: Conclusion, truth: Mapping[str, Any]) -> dict[str, Any]:
         """Return what the correction leaves of the simulated bench's exact phase."""

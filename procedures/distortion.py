@@ -9,7 +9,7 @@ the inverse map, verifies it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from holocal.loop.devices import Frame
-from holocal.loop.procedure import Conclusion, Judgement, Outcome, Plan, Shot
+from holocal.loop.procedure import Conclusion, Judgement, Outcome, Plan, Remeasured, Shot
 from holocal.loop.reference import Reference
 from holocal.records.facts import RigFacts
 from procedures._holograms import response_in_force
@@ -184,6 +184,20 @@ class Distortion:
         from procedures._distortion_result import conclusion
 
         return conclusion(state, frames)
+
+    def remeasure(
+        self,
+        facts: RigFacts,
+        calibration: Mapping[str, Any],
+        parameters: Parameters,
+        reference: Reference,
+        seed: int,
+    ) -> Generator[Shot, Frame, Remeasured]:
+        """Yield the frames that measure the accepted map; return how far its spots are from their places."""
+        from procedures._distortion_check import remeasured
+
+        state = self.with_camera(self.start(facts, calibration, parameters, seed), reference)
+        return remeasured(self, state, calibration[self.name])
 
     def against_truth(self, conclusion: Conclusion, truth: Mapping[str, Any]) -> dict[str, Any]:
         """Return how far the simulated bench's rays are from where the verification's spots were to be seen."""

@@ -8,7 +8,7 @@ holograms tell the sign. The verification measures other levels with another pat
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, Literal
@@ -22,7 +22,8 @@ from holocal.estimate.fringes import FEWEST_LEVELS, Fringes
 from holocal.estimate.registration import blob_image
 from holocal.estimate.response import ResponseTable, interpolate_response, next_levels, phase_difference, rms
 from holocal.loop.devices import Frame
-from holocal.loop.procedure import Conclusion, Judgement, Outcome, Plan, Shot
+from holocal.loop.procedure import Conclusion, Judgement, Outcome, Plan, Remeasured, Shot
+from holocal.loop.reference import Reference
 from holocal.records.facts import RigFacts
 from procedures._exposure import next_guess
 from procedures._holograms import Engine, image_levels, response_in_force
@@ -40,13 +41,18 @@ FINER_ROWS_DIM = 0.6  # the verification's rows send up to 1.6 times as much lig
 
 
 class Parameters(BaseModel):
-    """What may be chosen; `sign` says whether the phase rises with the level, "auto" lets two holograms tell."""
+    """What may be chosen.
+
+    `sign` says whether the phase rises with the level, "auto" lets two holograms tell. Where the table's expected error
+    is `enough_rad` or less after the even grid of levels, no more are measured; 0: all `steps` are.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     target_rad: float = Field(default=0.02, gt=0.0, lt=1.0)
     steps: int = Field(default=5, ge=3, le=40)
     levels_per_step: int = Field(default=7, ge=3, le=64)
+    enough_rad: float = Field(default=0.0, ge=0.0, lt=1.0)
     verify_levels: int = Field(default=10, ge=8, le=200)
     sign: Literal["auto", "rising", "falling"] = "auto"
     wavelength_nm: float = Field(default=515.0, gt=0.0)
@@ -99,6 +105,13 @@ class State:
         return Engine(chosen.wavelength_nm, chosen.zones, chosen.iterations, chosen.device)
 
     @property
+    def all_measured(self) -> bool:
+        """Whether all levels that are wanted were measured."""
+        chosen, table = self.parameters, self.table
+        enough = table is not None and table.valid and table.sigma_rms_rad <= chosen.enough_rad
+        return self.measured >= chosen.steps or (self.measured >= GRID_STEPS and enough)
+
+    @property
     def sign_known(self) -> bool:
         """Whether the sign is known: given, or told by two pictures that differ."""
         return self.parameters.sign != "auto" or (len(self.alike) == 3 and abs(self.alike[1] - self.alike[2]) > TELLING)
@@ -115,7 +128,8 @@ def levels_of_step(state: State) -> tuple[int, ...]:
         levels = next_levels(state.table, np.array(state.shown, np.int64), chosen.levels_per_step)
     rng = np.random.default_rng([state.seed, state.step])
     # At both ends of a run a reference more: the noise is known from the first step, the drift to the last.
-    closing = (REFERENCE,) if state.measured in (0, chosen.steps - 1) else ()
+    last_step = chosen.steps - 1 if chosen.enough_rad == 0 else GRID_STEPS - 1  # there may be more: another reference
+    closing = (REFERENCE,) if state.measured in (0, last_step, chosen.steps - 1) else ()
     return (REFERENCE, *(int(level) for level in rng.permutation(levels)), *closing)
 
 
@@ -208,7 +222,7 @@ class Response:
             levels = pattern_of(state).levels(state.count // 2)
             yield _shot(state, "exposure", levels, exposure_s=state.guess_s, clip_limit=1.0, fresh=False)
             return
-        if state.measured < state.parameters.steps:
+        if not state.all_measured:
             if state.dark is None:
                 yield _shot(state, "dark", None)
             shown = pattern_of(state)
@@ -229,7 +243,7 @@ class Response:
         """Return the state with the exposure found, with these frames in the estimate, or with the sign."""
         if state.exposure_s == 0:
             return _with_exposure(replace(state, step=state.step + 1), frames[0])
-        if state.measured < state.parameters.steps:
+        if not state.all_measured:
             return _with_levels(state, frames)
         return _with_pictures(replace(state, step=state.step + 1), frames)
 
@@ -259,7 +273,7 @@ class Response:
             return Judgement(Outcome.CONTINUE, "looking for the exposure" if looking else "exposure found")
         chosen, sigma = state.parameters, state.table.sigma_rms_rad
         said = f"{len(state.fringes.levels)} levels, expected error {sigma:.4f} rad, target {chosen.target_rad:g}"
-        if state.measured < chosen.steps:
+        if not state.all_measured:
             return Judgement(Outcome.CONTINUE, said if state.table.valid else f"{said}: {state.fringes.reason}")
         if not state.table.valid:
             return Judgement(Outcome.STALLED, f"no fringe was found: {state.fringes.reason}")
@@ -286,6 +300,20 @@ class Response:
         pixels = choose_pixels(frames, state.dark, camera)
         light = light_of(frames, state.dark, pixels, camera=camera, exposure_s=frames[0].exposure_s)
         return conclusion(state, phases_of(light, shown, range(len(shown))))
+
+    def remeasure(
+        self,
+        facts: RigFacts,
+        calibration: Mapping[str, Any],
+        parameters: Parameters,
+        reference: Reference,
+        seed: int,
+    ) -> Generator[Shot, Frame, Remeasured]:
+        """Yield the frames that measure the accepted table; return how far it is from them."""
+        from procedures._response_check import remeasured
+
+        state = self.start(facts, calibration, parameters, seed)
+        return remeasured(self, state, calibration[self.name])
 
     def against_truth(self, conclusion: Conclusion, truth: Mapping[str, Any]) -> dict[str, float]:
         """Return the error of the table against a simulated rig's own, piston taken out, for `result.json` alone."""

@@ -8,7 +8,7 @@ parts, shown again with fresh initial phases, and the estimate is made anew from
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -18,7 +18,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from holocal.estimate.registration import Registration, blob_image, register
 from holocal.loop.devices import Frame
-from holocal.loop.procedure import Conclusion, Judgement, Outcome, Plan, Shot
+from holocal.loop.procedure import Conclusion, Judgement, Outcome, Plan, Remeasured, Shot
+from holocal.loop.reference import Reference
 from holocal.records.facts import RigFacts
 from procedures._holograms import Engine, image_levels, response_in_force
 from procedures._uniformity_exposure import with_exposure
@@ -253,6 +254,20 @@ class Uniformity:
         assert state.dark is not None
         dark = state.dark
         return conclusion(state, np.stack([brightness_of(frame, dark) for frame in frames]))
+
+    def remeasure(
+        self,
+        facts: RigFacts,
+        calibration: Mapping[str, Any],
+        parameters: Parameters,
+        reference: Reference,
+        seed: int,
+    ) -> Generator[Shot, Frame, Remeasured]:
+        """Yield the frames that measure the accepted correction; return how uneven they are."""
+        from procedures._uniformity_check import remeasured
+
+        state = self.start(facts, calibration, parameters, seed)
+        return remeasured(self, state, calibration[self.name])
 
     def _shot(
         self,

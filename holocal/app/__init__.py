@@ -10,5 +10,9 @@ capturing       a frame shown and captured at an exposure found for it
 health          packages, plug-ins, devices seen, a rig's pre-flight
 terminal        progress and errors on stderr, results on stdout
 report          a run directory -> one self-contained page
+export          a run directory -> one file for other programs
+checking        the accepted calibration measured again in a few frames
+history         the runs of a rig in time, and their plot
+comparing       two runs side by side
 ==============  ==========================================================
 """

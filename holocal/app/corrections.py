@@ -21,14 +21,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from holocal.errors import InputError
 from holocal.estimate.bench_pose import DISPLACEMENTS, bench_at
 from holocal.hologram.scenes.points import PointCloud
 from holocal.hologram.wavefront import Wavefront, field_basis
 from holocal.optics.bench import Array, Bench
 from holocal.records.calibration import Accepted
+from holocal.records.field_map import FieldMap, field_map, missing
 from holocal.records.response import PHASE, RESPONSE, PhaseResponse, response_of
-from holocal.units import DEGREE, NM
+from holocal.units import NM
 
 __all__ = ["PHASE", "RESPONSE", "Corrections", "FieldMap", "corrections_of"]
 
@@ -94,30 +94,6 @@ def _turned(field_tan: Array, axes: Array) -> Array:
     return np.asarray(turned[:, :2] / turned[:, 2:])
 
 
-@dataclass(frozen=True)
-class FieldMap:
-    """Values (h, w) over a rectangle of tangents (left, right, bottom, top), pixel centres half a pixel inside."""
-
-    values: Array
-    extent_tan: tuple[float, float, float, float]
-
-    def at(self, field_tan: Array) -> Array:
-        """Return the values (n,) at tangents (n, 2), bilinear; beyond the map its edge holds."""
-        left, right, bottom, top = self.extent_tan
-        height, width = self.values.shape
-        column = np.clip((field_tan[:, 0] - left) / (right - left) * width - 0.5, 0, width - 1)
-        row = np.clip((top - field_tan[:, 1]) / (top - bottom) * height - 0.5, 0, height - 1)
-        x, y = (
-            np.minimum(np.floor(place).astype(int), max(size - 2, 0))
-            for place, size in ((column, width), (row, height))
-        )
-        right_of, below = np.minimum(x + 1, width - 1), np.minimum(y + 1, height - 1)
-        u, v = column - x, row - y
-        upper = self.values[y, x] * (1 - u) + self.values[y, right_of] * u
-        lower = self.values[below, x] * (1 - u) + self.values[below, right_of] * u
-        return np.asarray(upper * (1 - v) + lower * v)
-
-
 def corrections_of(accepted: Mapping[str, Accepted], *, fov_rad: tuple[float, float]) -> Corrections:
     """Return the corrections of accepted runs; those that change nothing are named and left out.
 
@@ -132,11 +108,11 @@ def corrections_of(accepted: Mapping[str, Accepted], *, fov_rad: tuple[float, fl
         accepted = {name: other for name, other in accepted.items() if name not in superseded}
         found = replace(found, displacements=_displacements(one), superseded=superseded)
     if one := accepted.get(UNIFORMITY):
-        weight = _map(one, WEIGHT)
+        weight = field_map(one, WEIGHT)
         identities += _kept_out(UNIFORMITY, bool(np.all(weight.values == 1)))
         found = replace(found, weight=None if UNIFORMITY in identities else weight)
     if one := accepted.get(DISTORTION):
-        shift = (_map(one, SHIFTS[0]), _map(one, SHIFTS[1]))
+        shift = (field_map(one, SHIFTS[0]), field_map(one, SHIFTS[1]))
         identities += _kept_out(DISTORTION, not (shift[0].values.any() or shift[1].values.any()))
         found = replace(found, shift=None if DISTORTION in identities else shift)
     if one := accepted.get(ABERRATION):
@@ -153,7 +129,7 @@ def corrections_of(accepted: Mapping[str, Accepted], *, fov_rad: tuple[float, fl
 def _displacements(accepted: Accepted) -> Array:
     values = [accepted.maps.metadata.get(f"bench.{name}") for name in DISPLACEMENTS]
     if any(value is None for value in values):
-        raise _missing(accepted, "the displacements of its bench (metadata bench.*)")
+        raise missing(accepted, "the displacements of its bench (metadata bench.*)")
     return np.array([float(str(value)) for value in values])
 
 
@@ -161,31 +137,16 @@ def _kept_out(name: str, identity: bool) -> list[str]:
     return [name] if identity else []
 
 
-def _map(accepted: Accepted, channel: str) -> FieldMap:
-    values, extent = accepted.maps.channels.get(channel), accepted.maps.extent_deg
-    if values is None or extent is None:
-        raise _missing(accepted, f"channel {channel} with an extent")
-    left, right, bottom, top = (float(np.tan(angle * DEGREE)) for angle in extent)
-    return FieldMap(np.asarray(values, np.float64), (left, right, bottom, top))
-
-
 def _wavefront(accepted: Accepted, fov_rad: tuple[float, float]) -> Wavefront:
     """Return the accepted Zernike maps as polynomials over the field, fitted to their pixels inside it."""
     names = {int(match[1]): name for name in accepted.maps.channels if (match := NOLL.fullmatch(name))}
     wavelength = accepted.maps.metadata.get("wavelength_nm")
     if not names or not isinstance(wavelength, (int, float)):
-        raise _missing(accepted, "channels correction.noll_<j>_rad and a wavelength_nm")
-    maps = {j: _map(accepted, names[j]) for j in sorted(names)}
+        raise missing(accepted, "channels correction.noll_<j>_rad and a wavelength_nm")
+    maps = {j: field_map(accepted, names[j]) for j in sorted(names)}
     half = (float(np.tan(fov_rad[0] / 2)), float(np.tan(fov_rad[1] / 2)))
     line = 0.96 * np.linspace(-1, 1, 4 * _FIELD_DEGREE + 1)  # inside the centres of the border pixels of most maps
     nodes = np.stack(np.meshgrid(line * half[0], line * half[1]), axis=-1).reshape(-1, 2)
     inverse = np.linalg.pinv(field_basis(nodes, half, _FIELD_DEGREE))
     rows = tuple(tuple(float(c) for c in inverse @ one.at(nodes)) for one in maps.values())
     return Wavefront(tuple(maps), rows, half, _FIELD_DEGREE, float(wavelength) * NM)
-
-
-def _missing(accepted: Accepted, what: str) -> InputError:
-    return InputError(
-        f"the {accepted.procedure} calibration {accepted.entry} has no {what}.",
-        fix="Measure it again, or use `--corrections none`.",
-    )

@@ -6,7 +6,6 @@ import logging
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +17,14 @@ from holocal.loop.devices import Rig
 from holocal.loop.ending import close_quietly, dark_at_the_end
 from holocal.loop.lock import locked
 from holocal.loop.preflight import Expectations
-from holocal.loop.record import RUN_TIME, RunRecord
+from holocal.loop.record import RunRecord
 from holocal.loop.runner import Observer, RunResult, run
 from holocal.loop.shooting import EXPOSURE_EXCESS, guarded
 from holocal.loop.signals import interruptible, shielded
-from holocal.records import calibration, plugins
+from holocal.records import calibration, index, plugins
 from holocal.records.files import read_json
 from holocal.records.rig import RigConfig, identity
+from holocal.records.run_files import begun
 from holocal.records.safety import safety_of
 
 LOGGER = logging.getLogger("holocal.app")
@@ -122,17 +122,9 @@ def expectations(config: RigConfig, entries: Mapping[str, str], *, identities: b
     return Expectations(
         lock=lock_of(config.name),
         identity=expected,
-        measured_utc={name: _measured_utc(entry) for name, entry in entries.items()},
+        measured_utc={name: begun(entry) for name, entry in entries.items()},
         max_age_days=safety_of(config).max_calibration_age_days,
     )
-
-
-def _measured_utc(entry: str) -> datetime | None:
-    """Return when a run was begun, by the name of its directory; None for another name."""
-    try:
-        return datetime.strptime(entry.partition("-")[0], RUN_TIME).replace(tzinfo=UTC)
-    except ValueError:
-        return None
 
 
 def corrections(choice: str, rig: Mapping[str, Any]) -> dict[str, calibration.Accepted]:
@@ -145,10 +137,10 @@ def corrections(choice: str, rig: Mapping[str, Any]) -> dict[str, calibration.Ac
     calibration.check_identity(
         read_json(Path(choice) / "identity.json"),
         rig,
-        subject=f"run {found.entry}",
+        subject=f"run {Path(choice).name}",
         fix="Name a run of this rig, or `--corrections none`.",
     )
-    return {found.procedure: found}
+    return found
 
 
 def plan(procedure_name: str, rig: RigConfig, overrides: Mapping[str, Any]) -> dict[str, Any]:
@@ -190,6 +182,7 @@ def start(
         in_force = corrections(corrections_choice, rig_identity)
         entries = {name: found.entry for name, found in in_force.items()}
         config = configuration.RunConfig(procedure_name, rig, values, origins, seed, entries, keep_frames)
+        index.remember(runs)
         record = RunRecord.create(runs, procedure_name, config=config.toml(), identity=rig_identity)
         with record.open():
             return run(

@@ -10,6 +10,7 @@ reference       what the pre-flight learns of camera and light: dark level, nois
 sameness        whether two pictures are of one pattern
 preflight       what must hold before the first measurement
 drift           whether the light at the end is that of the pre-flight
+checking        an accepted calibration measured again
 ending          the panel blank and the light off on every way out
 record          the run directory
 checkpoint      a frozen state to a file and back, in two slots

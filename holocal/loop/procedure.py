@@ -6,7 +6,7 @@ The runner alone touches devices, disk, clock and signals; a procedure never doe
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any, Protocol, TypeVar, runtime_checkable
@@ -100,9 +100,12 @@ class Figure:
 class Conclusion:
     """What a procedure found: the numbers of the contract, the maps, the pictures.
 
-    `before`, `after`, `targets` have the contract's keys. `targets_met` is set by the procedure. `maps` go to
-    ``maps.exr`` (name -> (height, width) float32), `before_map` and `after_map` to ``before.exr`` and ``after.exr``;
-    `calibration` holds what `accept` would put in force: JSON scalars here, arrays in `maps`.
+    `before`, `after`, `targets` have the contract's keys. `sigma` has the standard errors of their numbers, under
+    "before" and "after" and, where a number lies in a table, the keys joined by "_" as in `targets`: what comparisons
+    over time are judged by. `targets_met` is set by the procedure. `maps` go to ``maps.exr`` (name -> (height, width)
+    float32), `before_map` and `after_map` to ``before.exr`` and ``after.exr``; `calibration` holds what `accept` would
+    put in force: JSON scalars here, arrays in `maps`. `parts` are the results of a run of several procedures, by their
+    names, in the order in which they were measured; each is accepted as if it had been a run by itself.
     """
 
     before: dict[str, Any]
@@ -116,8 +119,10 @@ class Conclusion:
     map_units: Mapping[str, str] = field(default_factory=dict)
     map_metadata: Mapping[str, Any] = field(default_factory=dict)  # further metadata of the maps' file
     extent_deg: tuple[float, float, float, float] | None = None
+    sigma: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     extra: dict[str, Any] = field(default_factory=dict)  # further keys of result.json
     figures: tuple[Figure, ...] = ()
+    parts: Mapping[str, Conclusion] = field(default_factory=dict)
 
 
 State = TypeVar("State")
@@ -196,3 +201,40 @@ class AgainstTruth(Protocol):
     def against_truth(self, conclusion: Conclusion, truth: Mapping[str, Any]) -> dict[str, Any]:
         """Return how far a conclusion is from the truth, JSON-ready."""
         ...
+
+
+@dataclass(frozen=True)
+class Remeasured:
+    """What a calibration leaves now: numbers under the keys of its result's `targets`, and their standard errors."""
+
+    after: Mapping[str, float]
+    sigma: Mapping[str, float]
+
+
+@runtime_checkable
+class Checkable(Protocol):
+    """What a procedure adds when its accepted result can be measured again in a few frames (`holocal check`)."""
+
+    def remeasure(
+        self, facts: RigFacts, calibration: Mapping[str, Any], parameters: Any, reference: Reference, seed: int
+    ) -> Generator[Shot, Frame, Remeasured]:
+        """Yield the shots under the calibration in force, be sent the frame of each, return what it leaves.
+
+        `calibration` is as in `start`, the procedure's own accepted run among it; `parameters` are those of that run,
+        `reference` is what the pre-flight learnt of the camera.
+
+        Raises
+        ------
+        RefusedError, InputError
+            The frames do not show what the calibration says they should.
+        """
+        ...
+
+
+def taken(shots: Iterable[Shot]) -> Generator[Shot, Frame, tuple[Frame, ...]]:
+    """Yield shots and return the frames that were sent for them: ``frames = yield from taken(shots)``."""
+    frames = []
+    for shot in shots:
+        frame = yield shot
+        frames.append(frame)
+    return tuple(frames)

@@ -10,7 +10,6 @@ import json
 import logging
 import os
 import secrets
-import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from datetime import UTC, datetime
@@ -26,15 +25,24 @@ from holocal.loop.environment import environment
 from holocal.loop.figures import write_figures
 from holocal.loop.lock import locked
 from holocal.loop.procedure import Conclusion
-from holocal.records.files import dump_json, make_directory, read_json, storage_error, write_bytes, write_json
+from holocal.records.files import (
+    dump_json,
+    dump_toml,
+    make_directory,
+    read_json,
+    read_toml,
+    storage_error,
+    write_bytes,
+    write_json,
+)
 from holocal.records.frames import write_counts
 from holocal.records.manifest import NAME as MANIFEST
 from holocal.records.manifest import write_manifest
 from holocal.records.maps import write_maps
+from holocal.records.run_files import RUN_TIME
 
 LETTERS = "abcdefghijkmnpqrstuvwxyz23456789"  # none that are mistaken for each other
 LOGGER = logging.getLogger("holocal")
-RUN_TIME = "%Y%m%dT%H%M%SZ"  # of a run directory's name
 MOST_BAD_FRAMES = 16  # kept of those that tripped a gate: 1.1 MB each
 
 
@@ -94,11 +102,7 @@ class RunRecord:
 
     def config(self) -> dict[str, Any]:
         """Return the resolved configuration that the run was started with."""
-        path = self.directory / "config.toml"
-        try:
-            return tomllib.loads(path.read_text(encoding="utf-8"))
-        except (OSError, tomllib.TOMLDecodeError) as error:
-            raise InputError(f"{path} cannot be read: {error}.") from error
+        return read_toml(self.directory / "config.toml")
 
     def check_identity(self, identity: Mapping[str, Any]) -> None:
         """Raise `RefusedError` when the rig is not the one that the run was started on."""
@@ -163,15 +167,30 @@ class RunRecord:
 
     def conclusion(self, conclusion: Conclusion, result: Mapping[str, Any]) -> None:
         """Write the maps, the figures and ``result.json``."""
+        self._write_maps(self.directory, conclusion)
+        write_figures(self.directory, conclusion.figures)
+        write_json(self.directory / "result.json", result)
+
+    def part(self, name: str, conclusion: Conclusion, result: Mapping[str, Any]) -> None:
+        """Write one procedure's result of a run of several to a directory of its own, complete for `accept`."""
+        directory = make_directory(self.directory / name)
+        config = self.config()
+        own = {**config, "procedure": name, "parameters": config.get("parameters", {}).get(name, {})}
+        own.pop("origins", None)
+        write_bytes(directory / "config.toml", dump_toml(own).encode())
+        write_json(directory / "identity.json", read_json(self.directory / "identity.json"))
+        self._write_maps(directory, conclusion)
+        write_json(directory / "result.json", result)
+
+    def _write_maps(self, directory: Path, conclusion: Conclusion) -> None:
         shared = {"extent_deg": conclusion.extent_deg, "run": self.directory.name, **conclusion.map_metadata}
         units = dict(conclusion.map_units)
         for name, picture in (("before", conclusion.before_map), ("after", conclusion.after_map)):
-            path = self.directory / f"{name}.exr"
-            write_maps(path, {"value": picture}, units={"value": units.get(name, "")}, metadata=shared)
+            write_maps(
+                directory / f"{name}.exr", {"value": picture}, units={"value": units.get(name, "")}, metadata=shared
+            )
         if conclusion.maps:
-            write_maps(self.directory / "maps.exr", conclusion.maps, units=units, metadata=shared)
-        write_figures(self.directory, conclusion.figures)
-        write_json(self.directory / "result.json", result)
+            write_maps(directory / "maps.exr", conclusion.maps, units=units, metadata=shared)
 
     def finish(
         self, status: str, *, render: Callable[[Path], bytes] | None, error: Mapping[str, Any] | None = None
@@ -189,14 +208,17 @@ class RunRecord:
 
 
 def read_journal(directory: Path) -> list[dict[str, Any]]:
-    """Return the lines of a run's journal; a torn last line is left out."""
+    """Return the lines of a run's journal, up to the first that is torn."""
     path = directory / "events.jsonl"
     if not path.is_file():
         return []
     lines = []
     for text in path.read_text(encoding="utf-8", errors="replace").splitlines():
         try:
-            lines.append(json.loads(text))
-        except ValueError:
+            line = json.loads(text)
+        except (ValueError, RecursionError):
             break
+        if not isinstance(line, dict) or "event" not in line:
+            break
+        lines.append(line)
     return lines

@@ -30,6 +30,7 @@ from holocal.loop.shooting import Shooter, Taken
 from holocal.loop.signals import StopRequest, stop_requests
 from holocal.records.facts import RigFacts
 from holocal.records.files import json_ready
+from holocal.records.run_files import part_entry
 
 SCHEMA = 1
 LOGGER = logging.getLogger("holocal.loop")
@@ -263,8 +264,21 @@ class _Loop:
         result = self._result(conclusion, judgement) | {"source_drift": None if drift is None else drift.relative}
         self.record.journal("verified", sentence=conclusion.sentence, after=conclusion.after, shots=self.shots)
         self.record.conclusion(conclusion, result)
+        self._write_parts(conclusion, result)
         LOGGER.info("%s", conclusion.sentence)
         return RunResult(result, conclusion.sentence, self.record.directory)
+
+    def _write_parts(self, conclusion: Conclusion, result: Mapping[str, Any]) -> None:
+        """Write the results of a run of several procedures, each with those before it that it was measured under."""
+        corrections = {key: entry for key, entry in result["corrections"].items() if key not in conclusion.parts}
+        for name, part in conclusion.parts.items():
+            shared = {key: result[key] for key in ("schema", "rig", "run", "seed")}
+            said = {**shared, "procedure": name, **told(part), "corrections": dict(corrections)}
+            if "truth" in result:
+                said["truth"] = result["truth"].get(name, {})
+            self.record.part(name, part, dict(json_ready(said)))
+            if part.targets_met and part.extra.get("correction") != "none":
+                corrections[name] = part_entry(self.record.directory.name, name)
 
     def _drift(self) -> Drift | None:
         """Return how far the light drifted since the pre-flight, and write it down."""
@@ -336,7 +350,7 @@ class _Loop:
         self.observer.incident(f"{shot.label}: {verdict.sentence}")
 
     def _result(self, conclusion: Conclusion, judgement: Judgement) -> dict[str, Any]:
-        extra = dict(conclusion.extra)
+        extra: dict[str, Any] = {}
         truth = self.rig.truth()
         if truth is not None:
             judge = self.procedure if isinstance(self.procedure, AgainstTruth) else None
@@ -346,17 +360,28 @@ class _Loop:
             "procedure": self.procedure.name,
             "rig": self.facts.name,
             "run": str(self.record.directory),
-            "targets_met": bool(conclusion.targets_met),
             "outcome": judgement.outcome.value,
-            "sentence": conclusion.sentence,
             "frames": self.shooter.frames,
             "preflight_frames": self.preflight_frames,
             "steps": self.step,
             "seconds": round(self.seconds(), 3),
             "seed": self.seed,
-            "before": conclusion.before,
-            "after": conclusion.after,
-            "targets": conclusion.targets,
+            **told(conclusion),
             "corrections": {name: found.entry for name, found in self.calibration.items()},
         }
+        if conclusion.parts:
+            result["parts"] = list(conclusion.parts)
         return dict(json_ready({**result, **extra}))
+
+
+def told(conclusion: Conclusion) -> dict[str, Any]:
+    """Return the keys of a result that say what was found."""
+    return {
+        "targets_met": bool(conclusion.targets_met),
+        "sentence": conclusion.sentence,
+        "before": conclusion.before,
+        "after": conclusion.after,
+        "targets": conclusion.targets,
+        "sigma": {side: dict(known) for side, known in conclusion.sigma.items()},
+        **conclusion.extra,
+    }

@@ -11,6 +11,7 @@ validate        pydantic's complaints as errors that name file and key
 files           atomic writes, JSON, TOML
 reading         files that a user names: size checked, errors as sentences
 maps            OpenEXR of named channels
+field_map       a map over directions, read between its pixels
 frames          PNG: what the panel is sent, and camera counts
 scene           a scene image -> intensity, checked at the border
 scene_data      what the files of the other scenes hold, as plain data
@@ -21,6 +22,10 @@ scene_views     the views of a light field, listed in a TOML file
 reading         a user's file opened, and what goes wrong said
 scene_toml      what the two lists have in common
 manifest        SHA-256 and size of every file of a run
+run_files       what a run directory says of itself, read without trust
+results         the numbers of a result, with sigma and target
+checks          the checks that were made of a rig's calibration
+index           all runs, for questions about their history
 calibration     which accepted runs are in force for a rig
 ==============  ==========================================================
 """

@@ -2,7 +2,7 @@
 
 One directory per rig under ``HOLOCAL_HOME`` (default: the user's data directory)::
 
-    <home>/rigs/<rig>/entries/<run>/     identity.json, result.json, maps.exr: copied from the run, never changed
+    <home>/rigs/<rig>/entries/<run>/     what `ENTRY_FILES` names, copied from the run, never changed
     <home>/rigs/<rig>/states/0003.json   procedure -> entry, and the state before
     <home>/rigs/<rig>/current.json       which state is in force; swapped by one rename
 """
@@ -13,30 +13,32 @@ import os
 import shutil
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from holocal.errors import InputError, RefusedError
-from holocal.records.files import make_directory, read_json, storage_error, sync, write_json
-from holocal.records.manifest import problems, read_manifest
+from holocal.records.files import make_directory, read_json, read_toml, storage_error, sync, write_json
+from holocal.records.manifest import read_manifest, require_intact
 from holocal.records.maps import Maps, read_maps
 from holocal.records.rig import digest
+from holocal.records.run_files import part_entry, parts_of
 
 SCHEMA = 1
-ENTRY_FILES = ("identity.json", "result.json", "maps.exr")
+ENTRY_FILES = ("identity.json", "config.toml", "result.json", "maps.exr")
 
 
 @dataclass(frozen=True)
 class Accepted:
-    """One accepted run: its result, its maps, and when it was accepted."""
+    """One accepted run: its result, its maps, when it was accepted, and the procedure's parameters."""
 
     procedure: str
     entry: str
     accepted_utc: str
     result: Mapping[str, Any]
     maps: Maps
+    parameters: Mapping[str, Any] = field(default_factory=dict)
 
 
 def home() -> Path:
@@ -87,15 +89,20 @@ def load(identity: Mapping[str, Any]) -> dict[str, Accepted]:
             str(state.get("accepted_utc", "")),
             read_json(folder / "result.json"),
             read_maps(folder / "maps.exr"),
+            dict(read_toml(folder / "config.toml").get("parameters", {})),
         )
     return loaded
 
 
-def read_run(run: Path) -> Accepted:
-    """Return a finished run as if it were accepted (``--corrections RUN``), after checking its files."""
+def read_run(run: Path) -> dict[str, Accepted]:
+    """Return what a finished run found as if it were accepted (``--corrections RUN``), after checking its files."""
     _check_complete(run)
-    result = read_json(run / "result.json")
-    return Accepted(str(result["procedure"]), run.name, "", result, read_maps(run / "maps.exr"))
+    found = {}
+    for part in parts_of(run).values() or (run,):
+        result = read_json(part / "result.json")
+        procedure = str(result["procedure"])
+        found[procedure] = Accepted(procedure, run.name, "", result, read_maps(part / "maps.exr"))
+    return found
 
 
 def check_identity(measured_on: Mapping[str, Any], rig: Mapping[str, Any], *, subject: str, fix: str) -> None:
@@ -135,22 +142,9 @@ def accept(run: Path, identity: Mapping[str, Any]) -> dict[str, Any]:
     _check_complete(run)
     result = read_json(run / "result.json")
     procedure = str(result["procedure"])
-    if result.get("targets_met") is not True:
-        raise RefusedError(
-            f"{run.name} did not meet its targets: {result.get('sentence', 'see its report')}",
-            why="A calibration that missed its target is evidence, not a calibration.",
-            fix=f"Run it again: `holocal run {procedure} --rig {result.get('rig')}`.",
-            measured=result.get("after"),
-            limit=result.get("targets"),
-            code="targets-missed",
-        )
-    if result.get("correction") == "none":
-        raise RefusedError(
-            f"{run.name} corrects nothing: {result.get('sentence', 'see its report')}",
-            why="It only shows the bench as it is.",
-            fix=f"Measure a correction: `holocal run {procedure} --rig {result.get('rig')}`.",
-            code="no-correction",
-        )
+    parts = parts_of(run) or {procedure: run}
+    for name, part in {procedure: run, **parts}.items():
+        _require_correction(run.name, name, read_json(part / "result.json"))
     check_identity(
         read_json(run / "identity.json"),
         identity,
@@ -164,9 +158,11 @@ def accept(run: Path, identity: Mapping[str, Any]) -> dict[str, Any]:
         for name, entry in state.get("accepted", {}).items()
         if read_json(directory / "entries" / entry / "identity.json") == dict(identity)
     }
-    _check_corrections(run.name, procedure, result.get("corrections", {}), accepted)
-    _copy_entry(run, directory)
-    return _advance(directory, state, {**accepted, procedure: run.name})
+    _check_corrections(run.name, set(parts), result.get("corrections", {}), accepted)
+    entries = {name: part.name if part == run else part_entry(run.name, name) for name, part in parts.items()}
+    for name, part in parts.items():
+        _copy_entry(part, directory, entries[name])
+    return _advance(directory, state, {**accepted, **entries})
 
 
 def rollback(rig: str) -> dict[str, Any]:
@@ -177,6 +173,26 @@ def rollback(rig: str) -> dict[str, Any]:
         raise RefusedError(f"rig {rig} has no accepted calibration in {directory}.", fix="There is nothing to undo.")
     write_json(directory / "current.json", {"schema": SCHEMA, "state": state["before"]})
     return _state(directory)
+
+
+def _require_correction(run: str, procedure: str, result: Mapping[str, Any]) -> None:
+    """Raise `RefusedError` unless a result met its targets and corrects something."""
+    if result.get("targets_met") is not True:
+        raise RefusedError(
+            f"{run} did not meet its targets: {result.get('sentence', 'see its report')}",
+            why="A calibration that missed its target is evidence, not a calibration.",
+            fix=f"Run it again: `holocal run {procedure} --rig {result.get('rig')}`.",
+            measured=result.get("after"),
+            limit=result.get("targets"),
+            code="targets-missed",
+        )
+    if result.get("correction") == "none":
+        raise RefusedError(
+            f"{run} corrects nothing: {result.get('sentence', 'see its report')}",
+            why="It only shows the bench as it is.",
+            fix=f"Measure a correction: `holocal run {procedure} --rig {result.get('rig')}`.",
+            code="no-correction",
+        )
 
 
 def _check_complete(run: Path) -> None:
@@ -191,26 +207,19 @@ def _check_complete(run: Path) -> None:
             limit="complete",
             code="not-complete",
         )
-    if found := problems(run):
-        raise InputError(
-            f"{run.name} is not what was measured: {' '.join(found)}",
-            fix="Measure again, or restore the files from a copy.",
-            measured=len(found),
-            limit=0,
-            code="damaged-run",
-        )
+    require_intact(run)
 
 
 def _check_corrections(
-    run: str, procedure: str, measured_under: Mapping[str, str], accepted: Mapping[str, str]
+    run: str, procedures: set[str], measured_under: Mapping[str, str], accepted: Mapping[str, str]
 ) -> None:
-    for name in sorted({*measured_under, *accepted} - {procedure}):
+    for name in sorted({*measured_under, *accepted} - procedures):
         if measured_under.get(name) != accepted.get(name):
             raise RefusedError(
                 f"{run} was measured under {name} = {measured_under.get(name) or 'none'}; "
                 f"in force is {accepted.get(name) or 'none'}.",
                 why="Corrections are measured on top of each other.",
-                fix=f"Measure again under what is in force: `holocal run {procedure}`.",
+                fix=f"Measure again under what is in force: `holocal run {' and '.join(sorted(procedures))}`.",
                 measured=measured_under.get(name),
                 limit=accepted.get(name),
                 code="other-corrections",
@@ -221,20 +230,35 @@ def _state(directory: Path) -> dict[str, Any]:
     pointer = directory / "current.json"
     if not pointer.is_file():
         return {}
-    name = read_json(pointer)["state"]
-    return read_json(directory / "states" / f"{name}.json") if name else {}
+    name = read_json(pointer).get("state")
+    if not name:
+        return {}
+    state = read_json(directory / "states" / f"{name}.json") if _is_name(name) else {}
+    accepted = state.get("accepted")
+    if not isinstance(accepted, dict) or not all(map(_is_name, [*accepted, *accepted.values()])):
+        raise InputError(
+            f"{directory} is damaged: {name!r} is no state of its calibration.",
+            fix="Restore the directory from a copy, or move it away and measure again.",
+            code="damaged-calibration",
+        )
+    return state
 
 
-def _copy_entry(run: Path, directory: Path) -> None:
-    entry = make_directory(directory / "entries") / run.name
+def _is_name(name: Any) -> bool:
+    """Return whether this is the name of something in its own directory."""
+    return isinstance(name, str) and name not in ("", ".", "..") and not set(name) & set("/\\\0")
+
+
+def _copy_entry(run: Path, directory: Path, name: str) -> None:
+    entry = make_directory(directory / "entries") / name
     if entry.is_dir():
         return
-    partial = entry.with_name(f".{run.name}.{os.getpid()}.tmp")
+    partial = entry.with_name(f".{name}.{os.getpid()}.tmp")
     try:
         partial.mkdir()
-        for name in ENTRY_FILES:
-            shutil.copyfile(run / name, partial / name)
-            sync(partial / name)
+        for file in ENTRY_FILES:
+            shutil.copyfile(run / file, partial / file)
+            sync(partial / file)
         partial.rename(entry)
         sync(entry.parent)
     except OSError as error:
@@ -245,7 +269,7 @@ def _copy_entry(run: Path, directory: Path) -> None:
 
 def _advance(directory: Path, before: Mapping[str, Any], accepted: Mapping[str, str]) -> dict[str, Any]:
     states = make_directory(directory / "states")
-    number = 1 + max((int(path.stem) for path in states.glob("[0-9]*.json")), default=0)
+    number = 1 + max((int(path.stem) for path in states.glob("*.json") if path.stem.isdecimal()), default=0)
     state = {
         "schema": SCHEMA,
         "state": f"{number:04d}",

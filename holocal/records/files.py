@@ -11,6 +11,7 @@ import hashlib
 import json
 import math
 import os
+import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -123,11 +124,23 @@ def read_json(path: Path) -> dict[str, Any]:
         raise InputError(f"{path} does not exist.", fix="Check the path.") from error
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}.") from error
-    except ValueError as error:  # JSON and Unicode errors both
+    except (ValueError, RecursionError) as error:  # JSON and Unicode errors both; brackets without end
         raise InputError(f"{path} is not a JSON file: {error}.") from error
     if not isinstance(value, dict):
         raise InputError(f"{path} holds a {type(value).__name__}; an object was expected.")
     return value
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Return the tables of a TOML file; `InputError` when it is absent or not TOML."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise InputError(f"{path} does not exist.", fix="Check the path.") from error
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}.") from error
+    except (ValueError, RecursionError) as error:  # TOML and Unicode errors both
+        raise InputError(f"{path} is not a TOML file: {error}.") from error
 
 
 def one_line(text: str) -> str:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Mapping
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from holocal.errors import InputError
@@ -43,20 +44,57 @@ def read_manifest(directory: Path) -> dict[str, Any]:
             measured=manifest.get("schema"),
             limit=SCHEMA,
         )
+    files = manifest.get("files")
+    if not isinstance(files, Mapping) or not all(map(_is_entry, files.values())):
+        raise InputError(
+            f"{directory / NAME} is damaged: it lists no files.", fix="Restore it from a copy, or measure again."
+        )
     return manifest
+
+
+def _is_entry(said: Any) -> bool:
+    return isinstance(said, Mapping) and isinstance(said.get("bytes"), int) and isinstance(said.get("sha256"), str)
 
 
 def problems(directory: Path) -> list[str]:
     """Return what differs between a run directory and its manifest, a sentence each; empty when all is well."""
     listed = read_manifest(directory)["files"]
-    found = []
-    for name, said in listed.items():
-        path = directory / name
-        if not path.is_file():
-            found.append(f"{name} is missing.")
-        elif path.stat().st_size != said["bytes"]:
-            found.append(f"{name} has {path.stat().st_size} bytes; the manifest says {said['bytes']}.")
-        elif sha256_of(path) != said["sha256"]:
-            found.append(f"{name} was changed: its SHA-256 is not the manifest's.")
+    found = [_problem(directory, name, said) for name, said in listed.items()]
     found += [f"{name} is not in the manifest." for name in listed_files(directory) if name not in listed]
-    return found
+    return [sentence for sentence in found if sentence]
+
+
+def require_intact(directory: Path) -> dict[str, Any]:
+    """Return a run's manifest after checking every file; `InputError`, naming what differs, for a damaged run."""
+    if not directory.is_dir():
+        raise InputError(f"{directory} is not a run directory.", fix="Give the path of a run, or use `--runs DIR`.")
+    if found := problems(directory):
+        raise InputError(
+            f"{directory.name} is not what was measured: {' '.join(found)}",
+            why="Its numbers would be taken for measured ones.",
+            fix="Restore the files from a copy, or measure again.",
+            measured=len(found),
+            limit=0,
+            code="damaged-run",
+        )
+    return read_manifest(directory)
+
+
+def _problem(directory: Path, name: str, said: Mapping[str, Any]) -> str:
+    """Return what is wrong with a listed file, "" when nothing is."""
+    inside = PurePosixPath(name)
+    if inside.is_absolute() or ".." in inside.parts:
+        return f"{name} lies outside the run's directory."
+    path = directory / name
+    try:
+        if any(part.is_symlink() for part in (path, *path.parents) if directory in part.parents):
+            return f"{name} is a symbolic link: a run has its own files."
+        if not path.is_file():
+            return f"{name} is missing."
+        size = path.stat().st_size
+        if size != said["bytes"]:
+            return f"{name} has {size} bytes; the manifest says {said['bytes']}."
+        same = sha256_of(path) == said["sha256"]
+    except (OSError, ValueError) as error:
+        return f"{name} cannot be read: {error}."
+    return "" if same else f"{name} was changed: its SHA-256 is not the manifest's."

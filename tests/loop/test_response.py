@@ -23,6 +23,7 @@ from holocal.records.response import PHASE, response_of
 from holocal.records.rig import load_rig
 from procedures._holograms import response_in_force
 from procedures._response_frames import MOST_PIXELS
+from procedures.all import quick_response
 from procedures.response import Parameters, Response, levels_of_step, pattern_of, verify_levels
 from procedures.uniformity import Parameters as UniformityParameters
 from procedures.uniformity import Uniformity
@@ -121,6 +122,16 @@ def test_a_response_short_of_a_turn_and_bent_is_found_within_the_target(short):
     assert result["after"]["range_rad"] == pytest.approx(SHORT[-1] - SHORT[0], abs=0.03)
     assert 0.8 < result["fit"]["chi2"] < 1.2
     assert len(procedure.state.pixels) <= MOST_PIXELS
+
+
+@pytest.mark.parametrize(("table", "at_most"), [(None, 40), (SHORT, 52)])
+def test_where_it_is_known_well_enough_no_more_levels_are_measured(tmp_path, table, at_most):
+    """As one of all procedures: a straight response takes the even grid alone, a bent one what it needs."""
+    done, procedure, _ = go(bench(table), tmp_path, **quick_response().model_dump())
+    assert done.result["targets_met"]
+    assert done.result["frames"] <= at_most
+    assert error_of(done.result, nominal_table(256) if table is None else table) <= 0.02
+    assert procedure.state.shown[-1] == 0  # the last frame is a reference: the drift is known to the end
 
 
 def test_the_verification_shows_other_levels_through_other_pixels(short):

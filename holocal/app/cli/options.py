@@ -50,12 +50,26 @@ def found_run(run: Path, runs: Path = DEFAULT_RUNS) -> Path:
 
     if run.is_dir():
         return run
-    matches = sorted(path for path in runs.glob(f"*{run.name}") if path.is_dir()) if run.name == str(run) else []
+    matches = _matching(run.name, runs) if run.name == str(run) else []
     if len(matches) == 1:
         return matches[0]
     raise InputError(
         f"run {run}: {len(matches)} run directories of that name." if matches else f"run {run} does not exist.",
-        fix=f"Give its path, or --runs DIR. Looked in {runs.resolve()}.",
+        fix=f"Give its path, or --runs DIR. Looked in {runs.resolve()} and where runs were made before.",
         measured=len(matches),
         limit=1,
     )
+
+
+def _matching(ending: str, runs: Path) -> list[Path]:
+    """Return the runs whose name ends so: those in `runs`, else those made elsewhere."""
+    try:
+        here = sorted(path for path in runs.glob("*") if path.name.endswith(ending) and path.is_dir())
+    except OSError:
+        here = []
+    if here:
+        return here
+    from holocal.records import index
+
+    with index.opened() as known:
+        return [path for path in known.named(ending) if path.is_dir()]

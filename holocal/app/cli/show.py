@@ -14,7 +14,7 @@ def show(
     debug: options.Debug = False,
 ) -> None:
     """Show what a run found: verdict, numbers before and after, steps."""
-    from holocal.app.report.numbers import number
+    from holocal.app.report.numbers import goals, number
     from holocal.app.terminal import emit, emit_json
     from holocal.errors import InputError
     from holocal.loop.record import read_journal
@@ -33,11 +33,9 @@ def show(
     emit(f"{directory.name}  {status}")
     if found:
         emit(str(found["sentence"]))
-        for name, after in found["after"].items():
-            if not isinstance(after, (dict, list)):
-                target = found["targets"].get(name)
-                wanted = "" if target is None else f"   target {number(target)}"
-                emit(f"  {name:<24} {number(found['before'].get(name)):>10} -> {number(after):>10}{wanted}")
+        for row in goals(found):
+            wanted = "" if row["target"] is None else f"   target {number(row['target'])}"
+            emit(f"  {row['name']:<35} {number(row['before']):>10} -> {number(row['after']):>10}{wanted}")
     elif (directory / "error.json").is_file():
         emit(str(read_json(directory / "error.json")["what"]))
     for step in steps:

@@ -79,7 +79,7 @@ def convergence(steps: Sequence[Mapping[str, Any]]) -> str | None:
         for step in steps
         if _is_number(step["progress"].get("value")) and _is_number(step["progress"].get("target"))
     ]
-    if not points:
+    if not points or len({said.get("quantity") for _, said in points}) > 1:  # a run of several procedures
         return None
     numbers = [number for number, _ in points]
     values = [said["value"] for _, said in points]

@@ -12,7 +12,7 @@ from jinja2 import Environment, StrictUndefined
 
 from holocal import __version__
 from holocal.app.report.drawing import convergence, draw
-from holocal.app.report.numbers import number
+from holocal.app.report.numbers import goals, number
 from holocal.loop.figures import read_figures
 from holocal.loop.record import read_journal
 from holocal.records.files import read_json
@@ -33,7 +33,7 @@ def page(directory: Path) -> str:
         result=result,
         error=error,
         verdict=_verdict(result, error, steps),
-        goals=_goals(result),
+        goals=[] if result is None else goals(result),
         figures=[{"figure": figure, "data": draw(figure)} for figure in read_figures(directory)],
         convergence=convergence(steps),
         steps=steps,
@@ -77,17 +77,6 @@ def _verdict(result: Mapping[str, Any] | None, error: Mapping[str, Any] | None, 
             "sentence": f"{error['what']} {len(steps)} steps were finished.",
         }
     return {"class": "failed", "word": "Unfinished", "sentence": f"The run was cut off after {len(steps)} steps."}
-
-
-def _goals(result: Mapping[str, Any] | None) -> list[dict[str, Any]]:
-    if result is None:
-        return []
-    before, after, targets = result["before"], result["after"], result["targets"]
-    return [
-        {"name": name, "before": before.get(name), "after": after.get(name), "target": targets.get(name)}
-        for name in {**before, **after}
-        if not isinstance(after.get(name), (dict, list))
-    ]
 
 
 def _scalars(result: Mapping[str, Any] | None) -> dict[str, Any]:

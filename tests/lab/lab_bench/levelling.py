@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from holocal.loop.devices import Frame
-from holocal.loop.procedure import Conclusion, Figure, Judgement, Outcome, Plan, Shot
+from holocal.loop.procedure import Conclusion, Figure, Judgement, Outcome, Plan, Remeasured, Shot
+from holocal.loop.reference import Reference
 from holocal.records.facts import RigFacts
 
 
@@ -109,6 +110,7 @@ class Levelling:
             maps={"correction.intensity_weight": mean / mean.max(), "valid": valid.astype(np.float32)},
             before_map=mean,
             after_map=after,
+            extra={"mean": float(after.mean())},
             extent_deg=(-12.5, 12.5, -10.0, 10.0),
             figures=(
                 Figure("field", "The field", "pair", {"before": mean, "after": after, "valid": valid}, "counts/s"),
@@ -118,6 +120,14 @@ class Levelling:
                 Figure("picture", "Picture", "image", {"picture": after}),
             ),
         )
+
+    def remeasure(
+        self, facts: RigFacts, calibration: Mapping[str, Any], parameters: Parameters, reference: Reference, seed: int
+    ) -> Generator[Shot, Frame, Remeasured]:
+        state = self.start(facts, calibration, parameters, seed)
+        frame = yield self._shot(state, "check", 2000)
+        was = float(calibration[self.name].result["mean"])
+        return Remeasured({"spread": abs(float(np.mean(frame.counts)) / frame.exposure_s / was - 1)}, {"spread": 0.02})
 
     def _shot(self, state: State, label: str, number: int) -> Shot:
         noise = np.random.default_rng([state.seed, number])
