@@ -16,13 +16,14 @@ from procedures._alignment_fit import Seen, seen_by, zone_light
 from procedures._bench_light import BEAM, NUISANCE
 
 if TYPE_CHECKING:
-    from procedures.alignment import State
+    from procedures.alignment import Parameters, State
 
 Array = NDArray[np.float64]
 
 TOLD_APART = 0.7  # of the prior's standard deviation that is left: above it the data say nothing of a direction
 NAMED = 0.2  # of a direction's unit length: what is less is left out of its name
 MOST_MOVES = 6
+TRACED = 3  # times that moves are made better by rays
 STEP = 0.02  # degrees and mm, of the derivatives
 
 
@@ -30,12 +31,14 @@ STEP = 0.02  # degrees and mm, of the derivatives
 class Effects:
     """What displacements do to the picture, linear, over the n zones that are `lit`.
 
-    `position_px` (2 n, 12) and `wavefront_rad` (n modes, 12) are per degree and mm; `at_fit` and `nominal` are what the
-    bench found and the aligned one give.
+    `position_px` (2 n, 12) and `wavefront_rad` (n modes, 12) are per degree and mm; `root` (n, modes, modes) makes of a
+    zone's coefficients a vector as long as its rms. `at_fit` and `nominal` are what the bench found and the aligned one
+    give.
     """
 
     position_px: Array
     wavefront_rad: Array
+    root: Array
     at_fit: Seen
     nominal: Seen
     lit: NDArray[np.bool_]
@@ -68,7 +71,7 @@ def effects_of(state: State) -> Effects:
         _over_the_light(root, (a.wavefront.coefficients_rad - b.wavefront.coefficients_rad)[lit]) / (2 * STEP)
         for a, b in pairs
     ]
-    return Effects(np.stack(by_place, axis=1), np.stack(by_wave, axis=1), found, nominal, lit)
+    return Effects(np.stack(by_place, axis=1), np.stack(by_wave, axis=1), root, found, nominal, lit)
 
 
 def _roots(metric: Array) -> Array:
@@ -127,34 +130,42 @@ def screws_of(state: State, effects: Effects, sigma: Array) -> list[dict[str, An
 def moves_of(state: State, effects: Effects) -> dict[str, Any]:
     """Return the fewest screws that bring the bench within tolerance, and by how much to turn each.
 
-    Of all sets of as few screws the one that leaves least; the moves are the least-squares ones, and what they leave is
-    traced.
+    Of all sets of as few screws the one that leaves least, by the linear effects; its moves are then made better, and
+    judged, by rays.
     """
     chosen, values = state.parameters, state.values[len(NUISANCE) :]
-    rows = np.concatenate(
-        [
-            effects.position_px / (chosen.tolerance_px * np.sqrt(effects.zones)),
-            effects.wavefront_rad / (chosen.tolerance_rad * np.sqrt(effects.zones)),
-        ]
-    )
+    scale = np.sqrt(effects.zones) * np.array([chosen.tolerance_px, chosen.tolerance_rad])
+    rows = np.concatenate([effects.position_px / scale[0], effects.wavefront_rad / scale[1]])
     gram, right = rows.T @ rows, rows.T @ (rows @ values)
-    best: tuple[Sequence[int], Array] = ((), np.zeros(0))
+    best: tuple[tuple[int, ...], Array, tuple[float, float]] | None = None
     for count in range(MOST_MOVES + 1):
-        best = min((_moved(gram, right, set_) for set_ in combinations(range(len(values)), count)), key=_left)[1:]
-        left = values.copy()
-        left[list(best[0])] += best[1]
-        px, rad = effects.errors(left)
-        if px <= chosen.tolerance_px and rad <= chosen.tolerance_rad:
+        _, screws, by = min((_moved(gram, right, one) for one in combinations(range(len(values)), count)), key=_left)
+        for _ in range(TRACED if count else 1):
+            position, wavefront = _traced(state, effects, screws, by)
+            left = _rms(position, effects.zones), _rms(wavefront, effects.zones)
+            off = _off(left, chosen)
+            if best is None or off < _off(best[2], chosen):
+                best = (screws, by, left)
+            if off <= 1 or not count:
+                break
+            error = np.concatenate([position / scale[0], wavefront / scale[1]])
+            by = by - np.linalg.lstsq(rows[:, list(screws)], error, rcond=1e-9)[0]
+        if best is not None and _off(best[2], chosen) <= 1:
             break
-    after = _traced(state, left, effects.lit)
+    assert best is not None
     return {
         "tolerance_px": chosen.tolerance_px,
         "tolerance_rad": chosen.tolerance_rad,
-        "moves": {DISPLACEMENTS[k]: float(by) for k, by in zip(*best, strict=True)},
-        "leaves_px": after[0],
-        "leaves_rad": after[1],
-        "within_tolerance": bool(after[0] <= 1.1 * chosen.tolerance_px and after[1] <= 1.1 * chosen.tolerance_rad),
+        "moves": {DISPLACEMENTS[k]: float(by) for k, by in zip(best[0], best[1], strict=True)},
+        "leaves_px": best[2][0],
+        "leaves_rad": best[2][1],
+        "within_tolerance": bool(_off(best[2], chosen) <= 1),
     }
+
+
+def _off(left: tuple[float, float], chosen: Parameters) -> float:
+    """Return by how much what is left exceeds the tolerances: 1 is just within."""
+    return max(left[0] / chosen.tolerance_px, left[1] / chosen.tolerance_rad)
 
 
 def _moved(gram: Array, right: Array, screws: tuple[int, ...]) -> tuple[float, tuple[int, ...], Array]:
@@ -171,12 +182,13 @@ def _left(moved: tuple[float, tuple[int, ...], Array]) -> float:
     return moved[0]
 
 
-def _traced(state: State, values: Array, lit: NDArray[np.bool_]) -> tuple[float, float]:
+def _traced(state: State, effects: Effects, screws: Sequence[int], by: Array) -> tuple[Array, Array]:
+    """Return the picture's shifts (2 n,) and wavefronts (n modes,) after moves, by rays; a zone gone dark leaves 0."""
+    values = state.values[len(NUISANCE) :].copy()
+    values[list(screws)] += by
     seen = seen_by(zone_light(state), bench_at(nominal_bench(state.facts), values), state.values[: len(BEAM)])
-    rms = seen.wavefront.rms_rad[lit]
-    known = np.isfinite(rms) & np.isfinite(seen.off_px[lit, 0])
-    count = int(np.count_nonzero(known))
-    return _rms(seen.off_px[lit][known].ravel(), count), _rms(rms[known], count)
+    wavefront = _over_the_light(effects.root, seen.wavefront.coefficients_rad[effects.lit])
+    return np.nan_to_num(seen.off_px[effects.lit].ravel()), np.nan_to_num(wavefront)
 
 
 def _rms(values: Array, zones: int) -> float:

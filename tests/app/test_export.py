@@ -54,6 +54,7 @@ def test_pixel_centres_are_even_in_tangents_row_0_on_top(run):
 
 def test_hdf5_has_units_as_attributes_and_axes_as_scales(holocal, workplace, run):
     import h5py
+
     assert holocal("export", run, "--out", "run.h5").status == 0
     with h5py.File(workplace / "run.h5") as file:
         valid = file["maps/valid"]
