@@ -54,6 +54,7 @@ def gathered(
     farm: Farm,
     journal: Journal,
     said: Callable[[int, int], object] = lambda done, of: None,
+    still: Callable[[Any], bool] = lambda value: True,
 ) -> dict[str, Any]:
     """Return the results of all items by their keys, each as JSON has it, in the order of the items.
 
@@ -67,8 +68,10 @@ def gathered(
         Has what is done already, and is told of each result as it arrives.
     said
         Told how many of how many are done, at once and after each.
+    still
+        Whether a result that the journal has still holds: a file that it names may be gone.
     """
-    done = {key: value for key, value in journal.read().items() if key in items}
+    done = {key: value for key, value in journal.read().items() if key in items and still(value)}
     said(len(done), len(items))
     todo = {key: item for key, item in items.items() if key not in done}
     for key, result in arriving(work, todo, farm):
@@ -153,9 +156,9 @@ def _check_workers(client: Any, scheduler: str) -> None:
             f"a worker of {scheduler} cannot import holocal: {error}.", fix="Install it there too."
         ) from error
     if versions != {__version__}:
+        have = f"have holocal {', '.join(sorted(versions))}" if versions else "are none yet"
         raise RefusedError(
-            f"the workers of {scheduler} have holocal {', '.join(sorted(versions)) or 'of no version: there are none'}; "
-            f"this is {__version__}.",
+            f"the workers of {scheduler} {have}; this is {__version__}.",
             why="Numbers of two versions must not be mixed.",
             fix="Start workers with `dask worker`, with this version.",
             measured=sorted(versions),

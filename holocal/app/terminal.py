@@ -137,7 +137,7 @@ class Terminal:
             if self._status is not None:
                 filled = 24 * done // max(of, 1)
                 self._status.update(escape(f"{'━' * filled}{'╌' * (24 - filled)} {text}"))
-            elif done == first or done == of or 10 * done // of > 10 * (done - 1) // of:
+            elif done in (first, of) or 10 * done // of > 10 * (done - 1) // of:
                 self.say(f"  {text}")
 
         return said

@@ -47,8 +47,8 @@ class SpecTable(Table):
     distortion_rms_px: float | None = Field(default=None, gt=0.0)
     distortion_max_px: float | None = Field(default=1.0, gt=0.0)
     nonuniformity_rms: float | None = Field(default=0.1, gt=0.0)
-    light_fraction: Share | None = 0.3
-    field_coverage: Share | None = 0.9
+    light_fraction: Share | None = 0.25
+    field_coverage: Share | None = 0.5
     nyquist_use: float | None = Field(default=1.0, gt=0.0)
 
     @model_validator(mode="after")

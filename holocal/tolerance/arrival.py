@@ -42,9 +42,8 @@ class Arrival:
 
 def arrival(design: Design, built: Bench, light: SentLight) -> Arrival:
     """Return where the light arrives; a direction of which none does has `lit` 0 and is seen where it was sent."""
-    parts = []
-    for first in range(0, len(light.field_tan), AT_ONCE):
-        parts.append(_arrival(design, built, light.some(slice(first, first + AT_ONCE))))
+    starts = range(0, len(light.field_tan), AT_ONCE)
+    parts = [_arrival(design, built, light.some(slice(first, first + AT_ONCE))) for first in starts]
     return Arrival(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from holocal.optics.bench import Array, Bench, Pose
 from holocal.tolerance import light as light_of
@@ -29,7 +29,7 @@ METRICS = (
 Numbers = dict[str, float]
 
 
-def built_bench(design: Design, freedoms: Array) -> Bench:
+def built_bench(design: Design, freedoms: ArrayLike) -> Bench:
     """Return the bench with its twelve degrees of freedom (12,) in degrees and millimetres, in the file's order."""
     turn_m, move_m, turn_s, move_s = np.asarray(freedoms, np.float64).reshape(4, 3)
 
@@ -40,7 +40,7 @@ def built_bench(design: Design, freedoms: Array) -> Bench:
     return replace(design.bench, mirror=pose(turn_m, move_m), slm=pose(turn_s, move_s))
 
 
-def bench_error(design: Design, freedoms: Array) -> dict[str, Numbers]:
+def bench_error(design: Design, freedoms: ArrayLike) -> dict[str, Numbers]:
     """Return the numbers of `METRICS` for every one of `STAGES`, and what explains them under "more".
 
     What cannot be told, of a bench whose field is dark or out of the camera's sight, is NaN.

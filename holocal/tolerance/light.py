@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator, RectBivariateSpline
 from scipy.ndimage import binary_erosion
 
+from holocal.estimate.map_basis import Box, chebyshev, chebyshev_slopes
 from holocal.hologram.footprint import transmission
 from holocal.optics.bench import Array, Bench
 from holocal.optics.phase_function import VirtualPoints, trace_points
 from holocal.tolerance.arrival import Arrival, arrival
-from holocal.tolerance.design import FIELD, PANEL, SENT, Design, sent_light
+from holocal.tolerance.design import FIELD, PANEL, Design, sent_light
 
 AT_ONCE = 32  # directions, whose arrays stay in the cache
 PUPIL = 27  # points along the pupil's diameter, of light traced back from the eye
@@ -26,6 +27,7 @@ FINER = 3  # parts of a cell of the field, of which the region that counts is ma
 FLOOR = 0.25  # of the brightest direction: darker ones are not evened out, as the procedure `uniformity` has it
 EDGE = 2  # parts, 33 of 750 camera pixels: the margin that the procedure keeps from them
 FEWEST = 9  # parts, of which a non-uniformity is told
+FEWEST_LIT = 30  # directions of the nominal hologram, of which a picture is told
 
 
 @dataclass(frozen=True)
@@ -90,16 +92,16 @@ def of_nominal_hologram(design: Design, seen: Arrival) -> tuple[Brightness, Brig
     light = sent_light(design)
     some = seen.lit > 0
     looked = design.seen_directions()
-    if np.count_nonzero(some) < FEWEST:
+    if np.count_nonzero(some) < FEWEST_LIT:
         dark = np.zeros(len(looked))
         return Brightness(dark, dark, dark), Brightness(dark, dark, dark)
-    denser = _denser(light.field_tan, seen.seen_tan)
-    told = np.column_stack([seen.power, light.assigned.sum(axis=1), seen.lit, denser, light.field_tan])
-    at = np.nan_to_num(LinearNDInterpolator(seen.seen_tan[some], told[some])(looked))
+    denser = _denser(light.field_tan[some], seen.seen_tan[some], seen.lit[some])
+    told = [seen.power[some], light.assigned[some].sum(axis=1), seen.lit[some], denser, light.field_tan[some]]
+    at = np.nan_to_num(LinearNDInterpolator(seen.seen_tan[some], np.column_stack(told))(looked))
     power, assigned, lit, denser, from_tan = at[:, 0], at[:, 1], at[:, 2], at[:, 3], at[:, 4:]
     content = design.in_field(from_tan)
     return (
-        Brightness(np.where(content, power * denser, 0.0), np.where(content, assigned * denser, 0.0), lit),
+        Brightness(*(np.where(content, one, 0.0) for one in (power * denser, assigned * denser, lit))),
         Brightness(power, assigned, lit),
     )
 
@@ -129,10 +131,10 @@ def _traced_back(design: Design, built: Bench, tangents: Array) -> tuple[Array, 
     through = transmission(pupil_m, design.pupil_diameter_m) ** 2
     lit = np.where(rays.valid, on_panel, 0.0) * through
     sines = -rays.direction[..., :2]
-    spent = lit * through * area_m2 * design.beam(landing) / _shared_by(design, landing)
+    spent = lit * area_m2 * design.beam(landing) / _shared_by(design, landing)
     use = 2 * np.abs(sines).max(axis=-1) * design.panel.pitch_m / design.wavelength_m
     return (
-        np.sum(spent * design.envelope(sines), axis=1),
+        np.sum(spent * through * design.envelope(sines), axis=1),
         spent.sum(axis=1),
         lit.sum(axis=1) * step_m**2 / (np.pi * (design.pupil_diameter_m / 2) ** 2),
         np.max(np.where(spent > 0, use, 0.0), axis=1),
@@ -184,15 +186,13 @@ def _error_from_others() -> Array:
     return np.asarray(inverse / np.diag(inverse)[:, None])
 
 
-def _denser(sent_tan: Array, seen_tan: Array) -> Array:
-    """Return by how much the picture is denser than it was sent, (SENT^2,): the Jacobian d sent / d seen."""
-
-    def area(tangents: Array) -> Array:
-        grid = tangents.reshape(SENT, SENT, 2)
-        down, along = np.gradient(grid, axis=0), np.gradient(grid, axis=1)
-        return np.asarray(np.abs(down[..., 0] * along[..., 1] - down[..., 1] * along[..., 0]).ravel())
-
-    return np.asarray(area(sent_tan) / np.maximum(area(seen_tan), 1e-300))
+def _denser(sent_tan: Array, seen_tan: Array, weight: Array) -> Array:
+    """Return by how much the picture is denser than it was sent, (n,): the Jacobian d sent / d seen, by a cubic fit."""
+    box = Box.around(sent_tan)
+    scaled, root = box.scaled(sent_tan), np.sqrt(weight)[:, None]
+    found = np.linalg.lstsq(chebyshev(scaled, 3) * root, seen_tan * root, rcond=None)[0]
+    slope = np.einsum("ntj,ti->nij", chebyshev_slopes(scaled, 3), found) / box.half
+    return np.asarray(1.0 / np.maximum(np.abs(np.linalg.det(slope)), 1e-3))
 
 
 def _pupil_grid(diameter_m: float) -> tuple[Array, float]:

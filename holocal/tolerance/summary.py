@@ -18,7 +18,12 @@ from holocal.tolerance.cases import ALONE, SCALES, STEP, alone_key, drawn, drawn
 from holocal.tolerance.verdict import REASONS, SMALLEST, Errors, allowances, crossing, within
 
 PERCENTILES = (5, 50, 95)
-DRIVEN = ("wavefront_median_rad", "distortion_rms_px", "light_fraction", "field_coverage")  # of which sensitivities are told
+DRIVEN = (
+    "wavefront_median_rad",
+    "distortion_rms_px",
+    "light_fraction",
+    "field_coverage",
+)  # of which sensitivities are told
 WORST = 10
 
 Found = Mapping[str, Errors]
@@ -90,9 +95,7 @@ def wilson(passed: int, count: int) -> tuple[float, float]:
     return max(0.0, middle - half), min(1.0, middle + half)
 
 
-def _critical_scales(
-    study: Study, found: Found, stage: str, limits: Mapping[str, float]
-) -> list[tuple[float, str]]:
+def _critical_scales(study: Study, found: Found, stage: str, limits: Mapping[str, float]) -> list[tuple[float, str]]:
     """Return for each bench that was scaled at which scale it first misses a limit, and which."""
     ladder = [0.0, *sorted({*SCALES, 1.0})]
     every = []
@@ -125,7 +128,7 @@ def _freedoms(
     names = [name for name, _, _ in study.tolerances.freedoms()]
     widths = np.array([width for _, width, _ in study.tolerances.freedoms()])
     slopes = {name: np.array([_slope(found, k, name) for k in range(12)]) for name in DRIVEN}
-    drawings = np.abs([drawn(study.tolerances, seed, index) for index in range(study.benches)])
+    drawings: Array = np.stack([np.abs(drawn(study.tolerances, seed, k)) for k in range(study.benches)])
     made: dict[str, Any] = {}
     for k, freedom in enumerate(names):
         shares = {name: _share(slope * widths, k) for name, slope in slopes.items()}
@@ -162,7 +165,7 @@ def _rank_correlation(x: Array, y: Array) -> float | None:
     if np.count_nonzero(known) < 3 or np.ptp(x[known]) == 0 or np.ptp(y[known]) == 0:
         return None
     ranks = [np.argsort(np.argsort(values[known], kind="stable"), kind="stable") for values in (x, y)]
-    return float(np.corrcoef(ranks)[0, 1])
+    return float(np.asarray(np.corrcoef(ranks))[0, 1])
 
 
 def _allowed(

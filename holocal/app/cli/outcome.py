@@ -33,7 +33,9 @@ def report_study(done: Done, *, as_json: bool) -> int:
     terminal = Terminal()
     for line in study_table(done.result):
         terminal.say(line)
-    terminal.say(f"{'done' if met else 'target not met'}  {done.result['sentence']}", f"bold {'green' if met else 'yellow'}")
+    terminal.say(
+        f"{'done' if met else 'target not met'}  {done.result['sentence']}", f"bold {'green' if met else 'yellow'}"
+    )
     terminal.say(f"      {done.result['seconds']:.1f} s   report  {done.directory / 'report.html'}")
     if as_json:
         emit_json(done.result)
@@ -48,12 +50,16 @@ def study_table(result: Mapping[str, Any]) -> list[str]:
     lines = [f" {'of the worse benches (5 %)':<28}{'as built':>10}{'corrected':>11}{'own pose':>10}{'limit':>9}"]
     for name in [*result["before"]["spread"], "yield"]:
         values = [number(result[stage][name]) for stage in stages]
-        lines.append(f" {name:<28}{values[0]:>10}{values[1]:>11}{values[2]:>10}{number(result['targets'].get(name)):>9}")
-    lines.append(f" {'degree of freedom':<22}{'tolerance':>10}{'px per unit':>12}{'rad per unit':>13}{'allowed':>9}  fails by")
+        limit = number(result["targets"][name]) if name in result["targets"] else ""
+        lines.append(f" {name:<28}{values[0]:>10}{values[1]:>11}{values[2]:>10}{limit:>9}")
+    lines.append(
+        f" {'degree of freedom':<22}{'tolerance':>10}{'px per unit':>12}{'rad per unit':>13}{'allowed':>9}  fails by"
+    )
     for name, freedom in result["freedoms"].items():
-        slope, allowed = freedom["per_unit"], freedom["allowed"]["after"] or {}
+        slope, may = freedom["per_unit"], freedom["allowed"]["after"]
+        allowed = "" if may is None else number(may["tolerance"]) if may["tolerance"] is not None else "any"
         lines.append(
             f" {name:<22}{number(freedom['tolerance']):>10}{number(slope['distortion_rms_px']):>12}"
-            f"{number(slope['wavefront_median_rad']):>13}{number(allowed.get('tolerance')):>9}  {allowed.get('why', '')}"
+            f"{number(slope['wavefront_median_rad']):>13}{allowed:>9}  {may['why'] if may else ''}"
         )
     return lines

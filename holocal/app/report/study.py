@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib import rc_context
+from matplotlib.figure import Figure as Canvas
 from numpy.typing import NDArray
 
 from holocal.app.report import study_figures
@@ -64,7 +65,7 @@ def read_benches(path: Path) -> dict[str, NDArray[np.float64]]:
 
 def _figures(result: Mapping[str, Any], table: Mapping[str, NDArray[np.float64]]) -> list[dict[str, str]]:
     largest = max(result["freedoms"].items(), key=lambda item: item[1]["share"]["distortion_rms_px"])[0]
-    listed = (
+    listed: tuple[tuple[str, str, Callable[[], Canvas | None]], ...] = (
         (
             "Yield against the scale of the tolerances",
             "Share of benches within the spec when all tolerances are multiplied by one number; the dots are all "

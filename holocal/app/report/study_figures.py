@@ -30,6 +30,7 @@ DRIVEN = (
     ("field_coverage", "field covered"),
 )
 BINS = 36
+LEAST_RATIO = 0.03
 
 
 def yield_against_scale(result: Mapping[str, Any]) -> Canvas:
@@ -50,7 +51,8 @@ def yield_against_scale(result: Mapping[str, Any]) -> Canvas:
         color=TARGET,
     )  # fmt: skip
     axes.axvline(1.0, color=MUTED, linewidth=0.8)
-    axes.annotate("the tolerances as given", (1.0, 2), ha="left", va="bottom", color=MUTED, rotation=90, fontsize=8)
+    axes.annotate("the tolerances as given", (1.0, 50), xytext=(4, 0), textcoords="offset points", ha="left",
+                  va="center", color=MUTED, fontsize=8)  # fmt: skip
     _log_x(axes)
     axes.set_ylim(-3, 108)
     axes.set_xlim(low, largest)
@@ -84,7 +86,7 @@ def _histogram(axes: Axes, values: Sequence[Array], logarithmic: bool) -> None:
         return
     low, high = float(together.min()), float(together.max())
     high = high if high > low else low + 1.0
-    bins = np.geomspace(low, high, BINS + 1) if logarithmic else np.linspace(low, high, BINS + 1)
+    bins = (np.geomspace if logarithmic else np.linspace)(low, high, BINS + 1).tolist()
     for one, (_, _, colour) in zip(known, STAGES, strict=True):
         if len(one):
             axes.hist(one, bins=bins, color=colour, alpha=0.55, histtype="stepfilled", linewidth=0)
@@ -129,13 +131,17 @@ def allowed(result: Mapping[str, Any]) -> Canvas | None:
             said = one["allowed"][stage]
             open_ = said["tolerance"] is None
             ratio = (said["tried_to"] if open_ else said["tolerance"]) / one["tolerance"]
-            axes.plot([max(ratio, 0.02)], [row + shift], marker=">" if open_ else "o", color=colour, markersize=5,
+            marker = ">" if open_ else "o" if ratio > LEAST_RATIO else "<"
+            axes.plot([max(ratio, LEAST_RATIO)], [row + shift], marker=marker, color=colour, markersize=5,
                       linestyle="", label=label if row == 0 else None)  # fmt: skip
     axes.axvline(1.0, color=MUTED, linewidth=1.0)
     _log_x(axes)
     axes.set_yticks(rows, [_readable(name) for name in chosen])
     axes.set_ylim(len(chosen) - 0.5, -0.5)
-    axes.set_xlabel("tolerance alone, of the one given, at the wanted yield (> : more than was tried)")
+    axes.set_xlabel(
+        "tolerance alone, of the one given, at the wanted yield\n"
+        "(> more than was tried, < none: the drawing itself misses the spec)"
+    )
     axes.legend(frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return canvas
 
@@ -173,7 +179,9 @@ def _log_x(axes: Axes) -> None:
     axes.xaxis.set_minor_formatter(NullFormatter())
 
 
-def _canvas(width: float, height: float, rows: int = 1, columns: int = 1, *, sharey: bool = False) -> tuple[Canvas, Any]:
+def _canvas(
+    width: float, height: float, rows: int = 1, columns: int = 1, *, sharey: bool = False
+) -> tuple[Canvas, Any]:
     canvas = Canvas(figsize=(width, height), layout="constrained")
     every = canvas.subplots(rows, columns, sharey=sharey)
     for axes in np.atleast_1d(np.asarray(every, dtype=object)).ravel():
