@@ -42,9 +42,14 @@ class Arrival:
 
 def arrival(design: Design, built: Bench, light: SentLight) -> Arrival:
     """Return where the light arrives; a direction of which none does has `lit` 0 and is seen where it was sent."""
-    starts = range(0, len(light.field_tan), AT_ONCE)
-    parts = [_arrival(design, built, light.some(slice(first, first + AT_ONCE))) for first in starts]
-    return Arrival(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+    rows = np.flatnonzero(light.sent.any(axis=1))  # a small panel sends nothing in most directions of the margin
+    parts = [_arrival(design, built, light.some(rows[k : k + AT_ONCE])) for k in range(0, len(rows), AT_ONCE)]
+    count = light.sent.shape
+    made = Arrival(light.field_tan.copy(), np.zeros(count), np.zeros(count), np.zeros(count[0]), np.zeros(count[0]))
+    for k, part in enumerate(parts):
+        at = rows[k * AT_ONCE : (k + 1) * AT_ONCE]
+        made.seen_tan[at], made.wavefront_rad[at], made.amount[at], made.lit[at], made.power[at] = part
+    return made
 
 
 def _arrival(design: Design, built: Bench, light: SentLight) -> tuple[Array, Array, Array, Array, Array]:

@@ -61,13 +61,9 @@ def bench_error(design: Design, freedoms: ArrayLike) -> dict[str, Numbers]:
 
 
 def _wavefronts(design: Design, seen: Arrival, known: NDArray[np.bool_], found: dict[str, Numbers]) -> None:
-    judged = known & ~wavefront.zone_rows()
-    left = wavefront.corrected(seen, design, known)
-    values = {
-        "before": wavefront.rms(seen.wavefront_rad, design, seen.amount)[judged],
-        "after": wavefront.rms(left, design, seen.amount)[judged],
-        "pose": np.zeros(np.count_nonzero(judged)),  # made for the bench that it is shown on
-    }
+    before, after = wavefront.errors(seen, design, known)
+    judged = ~wavefront.zone_rows()[known]
+    values = {"before": before[judged], "after": after[judged], "pose": np.zeros(np.count_nonzero(judged))}
     for stage, value in values.items():
         found[stage]["wavefront_median_rad"] = float(np.median(value)) if len(value) else float("nan")
         found[stage]["wavefront_worst_rad"] = float(np.max(value)) if len(value) else float("nan")

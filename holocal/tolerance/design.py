@@ -134,7 +134,7 @@ class SentLight:
     assigned: Array
     shared_by: Array
 
-    def some(self, directions: slice) -> SentLight:
+    def some(self, directions: NDArray[np.intp]) -> SentLight:
         """Return the light of some of the directions."""
         return SentLight(
             self.field_tan[directions],

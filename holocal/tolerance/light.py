@@ -109,8 +109,12 @@ def of_nominal_hologram(design: Design, seen: Arrival) -> tuple[Brightness, Brig
 def of_true_hologram(design: Design, built: Bench) -> TrueLight:
     """Return the brightness that a hologram of the built bench itself gives, by rays traced back from the eye."""
     tangents = design.seen_directions()
-    parts = [_traced_back(design, built, tangents[k : k + AT_ONCE]) for k in range(0, len(tangents), AT_ONCE)]
-    power, spent, share, highest, above = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    rows = np.flatnonzero(_reached(design, built, tangents))
+    made = np.zeros((5, len(tangents)))
+    for k in range(0, len(rows), AT_ONCE):
+        at = rows[k : k + AT_ONCE]
+        made[:, at] = _traced_back(design, built, tangents[at])
+    power, spent, share, highest, above = made
     brightness = Brightness(power, spent, share)
     inside = brightness.inside
     total = float(spent[inside].sum())
@@ -121,9 +125,19 @@ def of_true_hologram(design: Design, built: Bench) -> TrueLight:
     )
 
 
-def _traced_back(design: Design, built: Bench, tangents: Array) -> tuple[Array, Array, Array, Array, Array]:
-    """Return for seen directions (n, 2), (n,) each: power that arrives, what is spent on it, share of the pupil lit,
-    the highest frequency over the panel's, and what is spent above that."""
+def _reached(design: Design, built: Bench, tangents: Array) -> NDArray[np.bool_]:
+    """Return of which directions (n, 2) the image of the pupil's square may lie on the panel, (n,)."""
+    half = 0.6 * design.pupil_diameter_m
+    corners = np.asarray(half * (np.indices((3, 3)).reshape(2, -1).T - 1.0), np.float64)
+    rays = trace_points(built, VirtualPoints.at(tangents[:, None]), corners)
+    low, high = rays.landing_m.min(axis=1), rays.landing_m.max(axis=1)
+    panel = np.asarray(design.panel.half_size_m)
+    return np.asarray(np.all((low < panel) & (high > -panel), axis=-1) | ~rays.valid.all(axis=-1))
+
+
+def _traced_back(design: Design, built: Bench, tangents: Array) -> Array:
+    """Return five rows for seen directions (n, 2), (5, n): power that arrives, what is spent on it, share of the pupil
+    that is lit, the highest frequency over the panel's, and what is spent above that."""
     pupil_m, step_m = _pupil_grid(design.pupil_diameter_m)
     rays = trace_points(built, VirtualPoints.at(tangents[:, None]), pupil_m)
     landing = np.where(rays.valid[..., None], rays.landing_m, 1.0)
@@ -133,12 +147,14 @@ def _traced_back(design: Design, built: Bench, tangents: Array) -> tuple[Array, 
     sines = -rays.direction[..., :2]
     spent = lit * area_m2 * design.beam(landing) / _shared_by(design, landing)
     use = 2 * np.abs(sines).max(axis=-1) * design.panel.pitch_m / design.wavelength_m
-    return (
-        np.sum(spent * through * design.envelope(sines), axis=1),
-        spent.sum(axis=1),
-        lit.sum(axis=1) * step_m**2 / (np.pi * (design.pupil_diameter_m / 2) ** 2),
-        np.max(np.where(spent > 0, use, 0.0), axis=1),
-        np.sum(np.where(use > 1, spent, 0.0), axis=1),
+    return np.stack(
+        [
+            np.sum(spent * through * design.envelope(sines), axis=1),
+            spent.sum(axis=1),
+            lit.sum(axis=1) * step_m**2 / (np.pi * (design.pupil_diameter_m / 2) ** 2),
+            np.max(np.where(spent > 0, use, 0.0), axis=1),
+            np.sum(np.where(use > 1, spent, 0.0), axis=1),
+        ]
     )
 
 
@@ -155,15 +171,15 @@ def evened_out(brightness: Brightness) -> tuple[float, float]:
     away; the procedure measures every 33. The price is the factor by which the mean brightness of the correctable
     region changes: weights take light from bright directions, and the panel shares it out among all.
     """
+    value = brightness.parts[brightness.correctable]
     inside = brightness.inside
-    value = brightness.value[inside]
-    if len(value) < FEWEST:
+    if len(value) < FEWEST or not inside.any():
         return float("nan"), 0.0
-    weight = np.ones(len(inside))
-    weight[inside] = value.min() / value
+    lowest = float(value.min())
+    weight = np.where(inside, np.minimum(lowest / np.maximum(brightness.value, 1e-300), 1.0), 1.0)
     spent = brightness.assigned.sum() / np.sum(weight * brightness.assigned)
-    wrong = (_error_from_others() @ brightness.value)[inside] / value
-    return float(np.sqrt(np.mean(wrong**2))), float(np.sum(weight[inside] * value) / np.sum(value) * spent)
+    wrong = (_error_from_others() @ brightness.value)[inside] / brightness.value[inside]
+    return float(np.sqrt(np.mean(wrong**2))), lowest / float(value.mean()) * float(spent)
 
 
 def _parts(values: Array) -> Array:

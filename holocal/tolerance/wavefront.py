@@ -31,34 +31,37 @@ def zone_rows() -> NDArray[np.bool_]:
     return np.outer(line, line).ravel()
 
 
-def rms(wavefront_rad: Array, design: Design, amount: Array) -> Array:
-    """Return the rms over the light of each direction, (D,) radians, piston and tilt removed; 0 in the dark."""
-    light = sent_light(design)
-    flat = without_plane(wavefront_rad, light.pupil_m, amount)
-    return np.asarray(np.sqrt(np.sum(amount * flat**2, axis=1) / np.maximum(amount.sum(axis=1), 1e-300)))
+def errors(seen: Arrival, design: Design, known: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Return the rms over its light of each of the `known` directions (D,), before and after correction, (k,) each.
+
+    Radians, piston and tilt removed.
+    """
+    at = np.flatnonzero(known)
+    wavefront, amount, pupil_m = seen.wavefront_rad[at], seen.amount[at], sent_light(design).pupil_m[at]
+    correction = np.zeros_like(wavefront)
+    zones = zone_rows()[at]
+    if np.count_nonzero(zones) >= FEWEST_ZONES:
+        over_field = field_terms(sent_light(design).field_tan[at], design.half_tan)
+        basis = _basis(design)[:, at]
+        coefficients = over_field @ _fit(
+            wavefront[zones], basis[:, zones], over_field[zones], pupil_m[zones], amount[zones]
+        )
+        correction = np.einsum("dj,jdn->dn", coefficients, basis)
+    both = without_plane(np.stack([wavefront, wavefront - correction]), pupil_m, amount)
+    before, after = np.sqrt(np.sum(amount * both**2, axis=-1) / np.maximum(amount.sum(axis=-1), 1e-300))
+    return np.asarray(before), np.asarray(after)
 
 
-def corrected(seen: Arrival, design: Design, known: NDArray[np.bool_]) -> Array:
-    """Return the wavefronts (D, N) less the correction that the zones among `known` directions (D,) give."""
-    at = np.flatnonzero(zone_rows() & known)
-    if len(at) < FEWEST_ZONES:
-        return seen.wavefront_rad
-    light = sent_light(design)
-    basis = _basis(design)
-    weight = seen.amount[at] / seen.lit[at, None]
-    modes = without_plane(basis[:, at], light.pupil_m[at], weight)
-    measured = without_plane(seen.wavefront_rad[at], light.pupil_m[at], weight)
-    information = np.einsum("izn,jzn,zn->zij", modes, modes, weight, optimize=True) / ZONE_RAD**2
-    right = np.einsum("izn,zn->zi", modes, measured * weight) / ZONE_RAD**2
-    over_field = field_terms(light.field_tan, design.half_tan)
-    terms = over_field[at]
+def _fit(wavefront: Array, basis: Array, terms: Array, pupil_m: Array, amount: Array) -> Array:
+    """Return the coefficients over the field (terms, modes) from zones' wavefronts (z, N), `basis` (modes, z, N)."""
+    weight = amount / amount.sum(axis=1, keepdims=True)
+    modes, measured = (without_plane(values, pupil_m, weight) for values in (basis, wavefront))
+    weighted = modes * weight / ZONE_RAD**2
+    information = np.einsum("izn,jzn->zij", weighted, modes, optimize=True)
     normal = np.einsum("zij,zk,zl->ikjl", information, terms, terms, optimize=True)
-    size = len(NOLL) * over_field.shape[1]
-    found = np.linalg.solve(
-        normal.reshape(size, size) + np.diag(_prior()), np.einsum("zi,zk->ik", right, terms).ravel()
-    )
-    coefficients = over_field @ found.reshape(len(NOLL), -1).T
-    return np.asarray(seen.wavefront_rad - np.einsum("dj,jdn->dn", coefficients, basis))
+    right = np.einsum("izn,zn,zk->ik", weighted, measured, terms, optimize=True)
+    found = np.linalg.solve(normal.reshape(right.size, right.size) + np.diag(_prior()), right.ravel())
+    return np.asarray(found.reshape(right.shape).T)
 
 
 @lru_cache(maxsize=2)

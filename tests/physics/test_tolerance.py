@@ -55,6 +55,10 @@ def test_the_nominal_bench_has_no_error_anywhere(design, small):
         assert found["more"]["lit_share"] == pytest.approx(1.0, abs=0.03)
 
 
+def _rms(design, seen):
+    return wavefront.errors(seen, design, np.ones(len(seen.lit), bool))[0]
+
+
 def perturbed_path_m(bench: Bench, freedom: int, tangents, slm_m):
     """First-order change of path per degree or millimetre, along the nominal bench's own rays (Fermat)."""
     step = np.radians(1.0) if freedom % 6 < 3 else 1e-3
@@ -82,7 +86,7 @@ def test_the_wavefront_of_each_small_misalignment_is_that_of_the_perturbed_paths
     light, amplitude = sent_light(design), 2e-3
     seen = arrival(design, built_bench(design, amplitude * np.eye(12)[freedom]), light)
     inside = np.flatnonzero(seen.lit > 0.1)[::9]
-    got = wavefront.rms(seen.wavefront_rad, design, seen.amount)[inside]
+    got = _rms(design, seen)[inside]
     path = perturbed_path_m(design.bench, freedom, light.field_tan[inside], light.slm_m)
     expected = 2 * np.pi / design.wavelength_m * amplitude * np.where(seen.amount[inside] > 0, path, 0.0)
     flat = without_plane(expected, light.pupil_m[inside], seen.amount[inside])
@@ -100,7 +104,7 @@ def test_wavefront_and_place_are_those_of_the_procedures_own_truth(design, truth
     expected = residuals_rad(
         design.bench, design.panel, truth, tangents, wavelength_m=515e-9, noll=(), coefficients_rad=np.zeros((1, 4, 0))
     )[0]
-    got = wavefront.rms(seen.wavefront_rad, design, seen.amount)[chosen]
+    got = _rms(design, seen)[chosen]
     np.testing.assert_allclose(got, expected, rtol=0.02)  # 25 x 15 points of the panel against 41 x 25
     x, own = panel_points(design.panel, truth, 515e-9)
     beam = illumination(x, truth)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from holocal.app.report.numbers import number
 from holocal.app.terminal import Terminal, emit, emit_json
-from holocal.app.tolerancing import Done
-from holocal.loop.runner import RunResult
+
+if TYPE_CHECKING:
+    from holocal.app.tolerancing import Done
+    from holocal.loop.runner import RunResult
 
 
 def report_run(done: RunResult, *, as_json: bool) -> int:
