@@ -27,7 +27,7 @@ from holocal.tolerance.table import benches_csv
 
 PROCEDURE = "tolerance"
 JOURNAL = "benches.jsonl"
-SECONDS_EACH = 0.25  # a bench on one core: for --dry-run only
+SECONDS_EACH = 0.12  # a bench on one core: for --dry-run only
 
 Said = Callable[[int, int], object]
 

@@ -23,7 +23,7 @@ FEWEST_SPOTS = 12  # below, the procedure makes no map
 
 @dataclass(frozen=True)
 class Distances:
-    """Distances in camera pixels at directions that no map was fitted to: (n,) each, empty where there are none."""
+    """Distances in camera pixels at directions that no map was fitted to, (n,) each; NaN where no map can be made."""
 
     before: Array
     corners: Array
@@ -46,7 +46,8 @@ def distances(design: Design, sent_tan: Array, seen_tan: Array, known: NDArray[n
     fit, judge = fitted_rows() & known, ~fitted_rows() & known
     before = np.linalg.norm((seen - sent)[judge], axis=1)
     if np.count_nonzero(fit) < FEWEST_SPOTS:
-        return Distances(before, before, before)
+        none = np.full(len(before), np.nan)
+        return Distances(before, none, none)
     four = outermost(sent, fit)
     corners = FourCorners.through(sent[four], seen[four])
     smooth = fit_smooth_map(sent[fit], seen[fit])

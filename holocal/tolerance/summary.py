@@ -15,7 +15,7 @@ from holocal.optics.bench import Array
 from holocal.records.tolerance_model import Study, Tolerances
 from holocal.tolerance.bench_error import METRICS, STAGES
 from holocal.tolerance.cases import ALONE, SCALES, STEP, alone_key, drawn, drawn_key, scaled_key, step_key
-from holocal.tolerance.verdict import REASONS, SMALLEST, Errors, allowances, crossing, within
+from holocal.tolerance.verdict import SMALLEST, Errors, allowances, crossing, reason, within
 
 PERCENTILES = (5, 50, 95)
 DRIVEN = (
@@ -33,7 +33,7 @@ def summary(study: Study, seed: int, found: Found) -> dict[str, Any]:
     """Return the study's result, JSON-ready, from the errors of every case by its key."""
     limits = study.tolerances.spec.limits()
     benches = [found[drawn_key(index)] for index in range(study.benches)]
-    stages = {stage: _stage(benches, stage, limits) for stage in STAGES}
+    stages = {stage: _stage(benches, found["nominal"], stage, limits) for stage in STAGES}
     critical = {stage: _critical_scales(study, found, stage, limits) for stage in STAGES}
     return {
         **stages,
@@ -49,8 +49,8 @@ def summary(study: Study, seed: int, found: Found) -> dict[str, Any]:
 _CORNERS = ("corners_rms_px", "corners_max_px")
 
 
-def _stage(benches: Sequence[Errors], stage: str, limits: Mapping[str, float]) -> dict[str, Any]:
-    """Return a stage's yield with its error, by criterion, the reasons of failure, and percentiles of the numbers."""
+def _stage(benches: Sequence[Errors], nominal: Errors, stage: str, limits: Mapping[str, float]) -> dict[str, Any]:
+    """Return a stage's yield with its error, by limit, what the drawing itself misses, and percentiles of numbers."""
     passed = sum(within(one, stage, limits) for one in benches)
     used = [allowances(one, stage, limits) for one in benches]
     by_limit = {name: sum(one[name] <= 1 for one in used) / len(used) for name in used[0]}
@@ -59,6 +59,7 @@ def _stage(benches: Sequence[Errors], stage: str, limits: Mapping[str, float]) -
         "yield_interval": list(wilson(passed, len(benches))),
         **{name: _spread([_number(one[stage][name]) for one in benches])[_bad(name)] for name in METRICS},
         "yield_by_limit": by_limit,
+        "nominal_misses": [name for name, value in allowances(nominal, stage, limits).items() if value > 1],
         "failures": _failures(used),
         "spread": {name: _spread([_number(one[stage][name]) for one in benches]) for name in METRICS},
     }
@@ -66,7 +67,7 @@ def _stage(benches: Sequence[Errors], stage: str, limits: Mapping[str, float]) -
 
 def _failures(used: Sequence[Mapping[str, float]]) -> dict[str, int]:
     """Return how many benches fail for each reason; a bench may have several."""
-    counted = Counter(reason for one in used for reason in {REASONS[name] for name, value in one.items() if value > 1})
+    counted = Counter(why for one in used for why in {reason(name, value) for name, value in one.items() if value > 1})
     return dict(sorted(counted.items(), key=lambda item: (-item[1], item[0])))
 
 
@@ -111,7 +112,7 @@ def _scale(study: Study, critical: Sequence[tuple[float, str]]) -> dict[str, Any
     wanted = study.tolerances.wanted_yield
     kept = int(np.ceil(wanted * len(scales)))  # benches that must still be within
     at = float(scales[len(scales) - kept])
-    first = Counter(REASONS[name] for scale, name in critical if np.isfinite(scale) and name)
+    first = Counter(why for scale, why in critical if np.isfinite(scale))
     return {
         "at_wanted_yield": at if np.isfinite(at) else None,
         "beyond_largest": not np.isfinite(at),
@@ -189,7 +190,7 @@ def _allowed(
         "tried_to": max(ALONE) * width,
         "positive": ends[0][0] * width if np.isfinite(ends[0][0]) else None,
         "negative": -ends[1][0] * width if np.isfinite(ends[1][0]) else None,
-        "why": REASONS.get(min(ends)[1], ""),
+        "why": min(ends)[1],
     }
 
 
@@ -225,7 +226,7 @@ def _worst(study: Study, seed: int, benches: Sequence[Errors], limits: Mapping[s
     return [
         {
             "bench": -index,
-            "why": REASONS[worst],
+            "why": reason(worst, used),
             "used": used if np.isfinite(used) else None,
             "freedoms": dict(zip(names, drawn(study.tolerances, seed, -index).tolist(), strict=True)),
             "errors": benches[-index],

@@ -9,7 +9,7 @@ from holocal.records.tolerance_model import Study
 from holocal.tolerance.bench_error import METRICS, STAGES
 from holocal.tolerance.cases import drawn, drawn_key
 from holocal.tolerance.summary import Found
-from holocal.tolerance.verdict import REASONS, allowances
+from holocal.tolerance.verdict import allowances, reason
 
 
 def benches_csv(study: Study, seed: int, found: Found) -> str:
@@ -29,10 +29,11 @@ def benches_csv(study: Study, seed: int, found: Found) -> str:
         cells += [_cell(errors[stage][name]) for stage in STAGES for name in METRICS]
         cells += [_cell(errors["more"][name]) for name in more]
         missed = {
-            stage: [name for name, used in allowances(errors, stage, limits).items() if used > 1] for stage in STAGES
+            stage: [reason(name, used) for name, used in allowances(errors, stage, limits).items() if used > 1]
+            for stage in STAGES
         }
         cells += ["no" if missed[stage] else "yes" for stage in STAGES]
-        cells += ["; ".join(dict.fromkeys(REASONS[name] for name in missed[stage])) for stage in STAGES[1:]]
+        cells += ["; ".join(dict.fromkeys(missed[stage])) for stage in STAGES[1:]]
         lines.append(",".join(cells))
     return "\n".join(lines) + "\n"
 

@@ -21,6 +21,7 @@ REASONS = {
     "field_coverage": "field not covered by the panel",
     "nyquist_use": "steeper than the panel's Nyquist frequency",
 }
+UNSEEN = "too little of the field seen to correct it"
 
 Errors = Mapping[str, Mapping[str, Any]]
 
@@ -47,6 +48,11 @@ def _used(name: str, value: float | None, limit: float) -> float:
     return (1 - value) / (1 - limit) if limit < 1 else (0.0 if value >= 1 else inf)
 
 
+def reason(name: str, used: float) -> str:
+    """Return what an allowance that is used up means; one that cannot be told is that of a bench in the dark."""
+    return REASONS[name] if isfinite(used) else UNSEEN
+
+
 def within(errors: Errors, stage: str, limits: Mapping[str, float]) -> bool:
     """Return whether a bench meets every limit at a stage."""
     return all(used <= 1 for used in allowances(errors, stage, limits).values())
@@ -55,7 +61,7 @@ def within(errors: Errors, stage: str, limits: Mapping[str, float]) -> bool:
 def crossing(
     factors: Sequence[float], errors: Sequence[Errors], stage: str, limits: Mapping[str, float]
 ) -> tuple[float, str]:
-    """Return at which factor (ascending, the first 0) a bench first misses a limit, and which one it is.
+    """Return at which factor (ascending, the first 0) a bench first misses a limit, and the reason.
 
     Between two factors each allowance is taken for a straight line. (infinity, "") where it meets all to the end.
     """
@@ -65,10 +71,11 @@ def crossing(
         if not missed:
             continue
         if k == 0:
-            return 0.0, max(missed, key=lambda name: missed[name])
+            worst = max(missed, key=lambda name: missed[name])
+            return 0.0, reason(worst, missed[worst])
         places = {name: _place(used[k - 1][name], value) for name, value in missed.items()}
         first = min(places, key=lambda name: places[name])
-        return factors[k - 1] + places[first] * (factors[k] - factors[k - 1]), first
+        return factors[k - 1] + places[first] * (factors[k] - factors[k - 1]), reason(first, missed[first])
     return inf, ""
 
 

@@ -34,11 +34,11 @@ def zone_rows() -> NDArray[np.bool_]:
 def errors(seen: Arrival, design: Design, known: NDArray[np.bool_]) -> tuple[Array, Array]:
     """Return the rms over its light of each of the `known` directions (D,), before and after correction, (k,) each.
 
-    Radians, piston and tilt removed.
+    Radians, piston and tilt removed; NaN after a correction for which there are too few zones.
     """
     at = np.flatnonzero(known)
     wavefront, amount, pupil_m = seen.wavefront_rad[at], seen.amount[at], sent_light(design).pupil_m[at]
-    correction = np.zeros_like(wavefront)
+    correction = np.full_like(wavefront, np.nan)
     zones = zone_rows()[at]
     if np.count_nonzero(zones) >= FEWEST_ZONES:
         over_field = field_terms(sent_light(design).field_tan[at], design.half_tan)

@@ -6,6 +6,7 @@ options         options that several commands share
 run, resume     measure; go on
 accept          put a result in force, or the one before
 report, show, verify   read what was done
+tolerance       what built benches will be worth
 render, capture        scene -> frame -> picture
 detect_grid            the grid of dots in a photograph
 rigs, procedures, doctor   what there is, and whether it works

@@ -59,7 +59,13 @@ def study_table(result: Mapping[str, Any]) -> list[str]:
     )
     for name, freedom in result["freedoms"].items():
         slope, may = freedom["per_unit"], freedom["allowed"]["after"]
-        allowed = "" if may is None else number(may["tolerance"]) if may["tolerance"] is not None else "any"
+        allowed = (
+            ""
+            if may is None
+            else number(may["tolerance"])
+            if may["tolerance"] is not None
+            else f">{number(may['tried_to'])}"
+        )
         lines.append(
             f" {name:<22}{number(freedom['tolerance']):>10}{number(slope['distortion_rms_px']):>12}"
             f"{number(slope['wavefront_median_rad']):>13}{allowed:>9}  {may['why'] if may else ''}"

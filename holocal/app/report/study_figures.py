@@ -51,7 +51,7 @@ def yield_against_scale(result: Mapping[str, Any]) -> Canvas:
         color=TARGET,
     )  # fmt: skip
     axes.axvline(1.0, color=MUTED, linewidth=0.8)
-    axes.annotate("the tolerances as given", (1.0, 50), xytext=(4, 0), textcoords="offset points", ha="left",
+    axes.annotate("the tolerances as given", (1.0, 104), xytext=(4, 0), textcoords="offset points", ha="left",
                   va="center", color=MUTED, fontsize=8)  # fmt: skip
     _log_x(axes)
     axes.set_ylim(-3, 108)
