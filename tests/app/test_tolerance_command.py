@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -177,3 +180,32 @@ def test_a_correction_that_fails_is_said_to_fail_at_the_right_scale(holocal, qui
     alone = answer.json["freedoms"]["mirror_rx_deg"]["allowed"]["after"]
     assert alone["positive"] == pytest.approx(1.0)
     assert alone["tolerance"] == pytest.approx(1 / 1.95996, rel=1e-4)
+
+
+@pytest.mark.slow
+def test_a_study_killed_in_two_processes_and_resumed_in_one_is_the_unbroken_one(holocal, workplace):
+    (workplace / "one.toml").write_text(
+        "[mirror]\nrotation_deg = [0.3, 0, 0]\nshift_mm = [0, 0, 0]\n"
+        "[slm]\nrotation_deg = [0, 0, 0]\nshift_mm = [0, 0.5, 0]\n"
+    )
+    asked = ("tolerance", "one.toml", "--rig", "simulated-small", "--benches", "5", "--scaled", "1")
+    whole = directory_of(holocal(*asked, "--json"))
+    code = "import sys; from holocal.app.cli.main import invoke; sys.exit(invoke(sys.argv[1:]))"
+    command = [sys.executable, "-c", code, *asked, "--runs", "cut", "--workers", "2"]
+    running = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    until = time.monotonic() + 120
+    while time.monotonic() < until and _lines(workplace / "cut") < 10:
+        time.sleep(0.05)
+    running.kill()
+    running.wait()
+    cut = next((workplace / "cut").iterdir())
+    assert 10 <= _lines(workplace / "cut") < 1 + 5 + 10 + 24 + 24
+    assert not (cut / "manifest.json").exists()
+    answer = holocal("tolerance", "--resume", cut, "--json")
+    assert answer.status in (0, 3), answer.err
+    assert (cut / "benches.csv").read_bytes() == (whole / "benches.csv").read_bytes()
+    assert problems(cut) == []
+
+
+def _lines(runs: Path) -> int:
+    return sum(path.read_bytes().count(b"\n") for path in runs.glob("*/benches.jsonl"))
