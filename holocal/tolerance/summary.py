@@ -53,15 +53,18 @@ def _stage(benches: Sequence[Errors], nominal: Errors, stage: str, limits: Mappi
     """Return a stage's yield with its error, by limit, what the drawing itself misses, and percentiles of numbers."""
     passed = sum(within(one, stage, limits) for one in benches)
     used = [allowances(one, stage, limits) for one in benches]
+    spread = {
+        name: _spread([_number(one[stage][name]) for one in benches], smallest=name in SMALLEST) for name in METRICS
+    }
     by_limit = {name: sum(one[name] <= 1 for one in used) / len(used) for name in used[0]}
     return {
         "yield": passed / len(benches),
         "yield_interval": list(wilson(passed, len(benches))),
-        **{name: _spread([_number(one[stage][name]) for one in benches])[_bad(name)] for name in METRICS},
+        **{name: spread[name][_bad(name)] for name in METRICS},
         "yield_by_limit": by_limit,
         "nominal_misses": [name for name, value in allowances(nominal, stage, limits).items() if value > 1],
         "failures": _failures(used),
-        "spread": {name: _spread([_number(one[stage][name]) for one in benches]) for name in METRICS},
+        "spread": spread,
     }
 
 
@@ -76,11 +79,16 @@ def _bad(name: str) -> str:
     return "p5" if name in SMALLEST else "p95"
 
 
-def _spread(values: Sequence[float]) -> dict[str, float | None]:
-    """Return percentiles of values; those that are not known count as worse than all others, and are counted."""
-    known = np.array([value for value in values if np.isfinite(value)])
-    numbers = np.percentile(known, PERCENTILES).tolist() if len(known) else [None] * len(PERCENTILES)
-    return {**{f"p{p}": v for p, v in zip(PERCENTILES, numbers, strict=True)}, "unknown": len(values) - len(known)}
+def _spread(values: Sequence[float], *, smallest: bool = False) -> dict[str, float | None]:
+    """Return percentiles of values; those that are not known count as worse than all others, and are counted.
+
+    `smallest`: small values are the bad ones. A percentile that is not known is None.
+    """
+    known = np.isfinite(values)
+    ranked = np.where(known, values, -np.inf if smallest else np.inf)
+    numbers = np.percentile(ranked, PERCENTILES, method="lower" if smallest else "higher").tolist()
+    told = {f"p{p}": v if np.isfinite(v) else None for p, v in zip(PERCENTILES, numbers, strict=True)}
+    return {**told, "unknown": int(np.count_nonzero(~known))}
 
 
 def _number(value: Any) -> float:
