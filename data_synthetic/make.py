@@ -96,6 +96,7 @@ def make(directory: Path) -> None:
     }
     _write_json(directory / "truth.json", known)
     make_scenes(directory)
+    write_text(directory / "tolerances.toml", TOLERANCES)
     files = sorted(path for path in directory.iterdir() if path.is_file() and path.name not in UNLISTED)
     _write_json(directory / "manifest.json", {path.name: described(path) for path in files})
 
@@ -118,6 +119,29 @@ def make_scenes(directory: Path) -> None:
             views += ["", "[[view]]", f'image = "{name}"', f"pupil_mm = [{x_mm}, {y_mm}]"]
     write_text(directory / "light_field.toml", "\n".join(views) + "\n")
 
+
+TOLERANCES = """\
+# Tolerances of a bench on an optical table, for `holocal tolerance data_synthetic/tolerances.toml`.
+schema = 1
+distribution = "normal"                # or "uniform": the numbers are then limits, not standard deviations
+wanted_yield = 0.95
+
+[mirror]                               # about and along x, y, z of the eye's frame
+rotation_deg = [0.1, 0.1, 0.2]
+shift_mm = [0.1, 0.1, 0.2]
+
+[slm]                                  # about and along x, y, z of the panel's own frame
+rotation_deg = [0.15, 0.15, 0.3]
+shift_mm = [0.2, 0.2, 0.5]
+distribution = "uniform"
+
+[spec]                                 # what an image must meet; left out: the defaults of docs/tolerance.md
+wavefront_worst_rad = 0.45             # the diffraction limit, a fourteenth of a wave
+distortion_max_px = 1.0                # camera pixels
+nonuniformity_rms = 0.1
+light_fraction = 0.5                   # of the nominal bench's, before it is evened out
+field_coverage = 0.75                  # of the nominal bench's
+"""
 
 LAYERS = """\
 # A ring 0.3 m away before bars at 2 m; the ring is its own mask.

@@ -25,6 +25,7 @@ from holocal.hologram.pipeline import render as render_points
 from holocal.hologram.settings import Direct, Method, Warped, Zones
 from holocal.optics.bench import Bench, Panel
 from holocal.records.cache import ArrayCache
+from holocal.records.calibration import Accepted
 from holocal.records.facts import RigFacts
 from holocal.records.files import storage_error
 from holocal.records.frames import PACKINGS, write_frame
@@ -120,12 +121,30 @@ def check(asked: Request, outputs: Outputs) -> None:
 
 def render(config: RigConfig, asked: Request, outputs: Outputs) -> dict[str, Any]:
     """Return the JSON of a rendered scene, after writing its files: one frame, or one for each of the rig's lines."""
-    began = time.monotonic()
-    scene = scenes.read(asked.scene, srgb=asked.srgb, colour=asked.colour)
-    read_s = time.monotonic() - began
+    return render_for(known_of(config, asked.corrections), config, asked, outputs)
+
+
+@dataclass(frozen=True)
+class Known:
+    """What a rig says of itself, and the corrections in force for it: the same for every scene."""
+
+    facts: RigFacts
+    in_force: Mapping[str, Accepted]
+
+
+def known_of(config: RigConfig, corrections: str) -> Known:
+    """Return what is asked of the rig once, before any scene is rendered for it."""
     with session.asked_rig(config) as rig:
         facts = rig.facts()
-    in_force = session.corrections(asked.corrections, identity(facts))
+    return Known(facts, session.corrections(corrections, identity(facts)))
+
+
+def render_for(known: Known, config: RigConfig, asked: Request, outputs: Outputs) -> dict[str, Any]:
+    """Return what `render` returns, for a rig that has been asked already."""
+    began = time.monotonic()
+    facts, in_force = known.facts, known.in_force
+    scene = scenes.read(asked.scene, srgb=asked.srgb, colour=asked.colour)
+    read_s = time.monotonic() - began
     fov_rad = (asked.fov_deg[0] * DEGREE, asked.fov_deg[1] * DEGREE)
     corrections = corrections_of(in_force, fov_rad=fov_rad)
     common = {

@@ -26,6 +26,7 @@ from holocal.records.scene_views import read_light_field
 
 Image = NDArray[np.float32]
 IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".exr", ".bmp", ".pgm", ".ppm", ".pnm")
+SUFFIXES = (*IMAGES, ".csv", ".obj", ".ply", ".toml")
 KINDS = f"images ({', '.join(IMAGES)}), points (.csv), meshes (.obj, .ply), layers and light fields (.toml)"
 _NEAREST_M, _PLACED_M = 0.01, 1.0  # a mesh nearer than the first is put at the second
 PHASES = ("random", "smooth", "zero")
@@ -45,9 +46,14 @@ class Scene:
         return self.contents[0 if colour is None or len(self.contents) == 1 else colour]
 
 
+def is_scene(path: Path) -> bool:
+    """Return whether a file's name says that it is a scene."""
+    return path.is_file() and path.suffix.lower() in SUFFIXES
+
+
 def check_kind(path: Path) -> None:
     """Raise `InputError` for a file whose name says that it is no scene."""
-    if path.exists() and path.suffix.lower() not in (*IMAGES, ".csv", ".obj", ".ply", ".toml"):
+    if path.exists() and path.suffix.lower() not in SUFFIXES:
         raise InputError(f"{path} is not a scene that can be read.", fix=f"Scenes are {KINDS}.")
 
 

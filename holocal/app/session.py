@@ -203,7 +203,7 @@ def resume(directory: Path, *, observer: Observer) -> RunResult:
     """Return the result of a run that was cut off, interrupted or lost its device, from its last finished step."""
     record = RunRecord.reopen(directory)
     config = record.config()
-    _check_version(directory)
+    check_version(directory)
     rig, ended = configuration.without_faults(configuration.stored_rig(config))
     if ended:
         record.opening.append(("faults-over", {"faults": ended}))
@@ -227,7 +227,8 @@ def resume(directory: Path, *, observer: Observer) -> RunResult:
         )
 
 
-def _check_version(directory: Path) -> None:
+def check_version(directory: Path) -> None:
+    """Raise `RefusedError` unless a run was started with this version of holocal."""
     began = read_json(directory / "environment.json").get("packages", {}).get("holocal")
     if began != __version__:
         raise RefusedError(

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import IO, Any, TextIO, cast
 
@@ -121,6 +122,25 @@ class Terminal:
         """Say what the run waits for, where there is a terminal."""
         if self._status is not None:
             self._status.update(escape(f"{what} ..."))
+
+    def counted(self, what: str) -> Callable[[int, int], None]:
+        """Return what is told how many of how many pieces are done: a bar on a terminal, else a line each tenth."""
+        began: list[tuple[float, int]] = []
+
+        def said(done: int, of: int) -> None:
+            now = time.monotonic()
+            if not began:
+                began.append((now, done))
+            since, first = began[0]
+            left = (now - since) * (of - done) / (done - first) if done > first else None
+            text = f"{what} {done} of {of}" + ("" if left is None else f", {left:.0f} s left")
+            if self._status is not None:
+                filled = 24 * done // max(of, 1)
+                self._status.update(escape(f"{'━' * filled}{'╌' * (24 - filled)} {text}"))
+            elif done in (first, of) or 10 * done // of > 10 * (done - 1) // of:
+                self.say(f"  {text}")
+
+        return said
 
     def incident(self, sentence: str) -> None:
         """Write a bad frame or a halved exposure."""

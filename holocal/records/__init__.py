@@ -6,6 +6,8 @@ plugins         what entry points offer; a broken one stops nothing
 rig             a rig's file: found, typed, fingerprinted
 rig_model       the simulated rig's file: every key with its range
 fault_model     what is to go wrong on a simulated rig
+tolerance_model what a bench may be off, and what its image must meet
+journal         finished pieces of work, a checked line each
 safety          what no run may exceed
 validate        pydantic's complaints as errors that name file and key
 files           atomic writes, JSON, TOML

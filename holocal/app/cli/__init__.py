@@ -9,6 +9,7 @@ check           measure what is in force again: holds, or drifted
 report, show, verify   read what was done
 export                 a run for other programs
 history, compare       runs in time; two of them side by side
+tolerance       what built benches will be worth
 render, capture        scene -> frame -> picture
 detect_grid            the grid of dots in a photograph
 rigs, procedures, doctor   what there is, and whether it works

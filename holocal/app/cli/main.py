@@ -32,6 +32,7 @@ from holocal.app.cli import (
     rigs,
     run,
     show,
+    tolerance,
     verify,
 )
 from holocal.app.memory import return_freed_memory
@@ -84,6 +85,7 @@ COMMANDS: tuple[Callable[..., None], ...] = (
     capture.capture,
     detect_grid.detect_grid,
     bench.bench,
+    tolerance.tolerance,
     rigs.rigs,
     procedures.procedures,
     doctor.doctor,

@@ -23,6 +23,12 @@ Corrections = Annotated[
     str, typer.Option("--corrections", metavar="accepted|none|RUN", help="Which corrections are applied.")
 ]
 Wavelength = Annotated[float, typer.Option("--wavelength-nm", help="Wavelength, nanometres.")]
+Workers = Annotated[
+    int, typer.Option("--workers", min=1, max=256, help="Processes on this machine; the numbers are the same.")
+]
+Scheduler = Annotated[
+    str | None, typer.Option("--scheduler", metavar="tcp://HOST:PORT", help="A Dask scheduler whose workers do it.")
+]
 RunDirectory = Annotated[Path, typer.Argument(metavar="RUN", help="A run directory, or the end of its name.")]
 
 DEFAULT_RIG = "simulated"

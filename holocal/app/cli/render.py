@@ -13,10 +13,13 @@ from holocal.app.cli import options
 
 def render(
     scene: Annotated[
-        Path,
-        typer.Argument(metavar="SCENE", help="Image, points .csv, mesh .obj .ply, layers or views .toml."),
+        list[Path],
+        typer.Argument(metavar="SCENE", help="Image, points .csv, mesh .obj .ply, layers or views .toml; or a folder."),
     ],
-    out: Annotated[Path, typer.Option("--out", help="The frame to write, PNG.")] = Path("frame.png"),
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="The frame to write, PNG (frame.png); of several scenes the directory (frames)."),
+    ] = None,
     packing: Annotated[str, typer.Option("--packing", metavar="rgb|mono8", help="How the panel wants it.")] = "rgb",
     phase_out: Annotated[Path | None, typer.Option("--phase-out", help="Phase before quantisation, EXR.")] = None,
     complex_out: Annotated[Path | None, typer.Option("--complex-out", help="Full-complex hologram, EXR.")] = None,
@@ -60,19 +63,22 @@ def render(
     ] = (750, 750),
     rig: options.Rig = options.DEFAULT_RIG,
     corrections: options.Corrections = "accepted",
+    workers: options.Workers = 1,
+    scheduler: options.Scheduler = None,
     seed: options.Seed = 0,
     set_: options.Set = None,
     json: options.Json = False,
     device: options.Device = "cpu",
     debug: options.Debug = False,
 ) -> None:
-    """Compute the SLM frame of a scene, with the rig's accepted corrections."""
-    from holocal.app import rendering
+    """Compute the SLM frame of a scene, with the rig's accepted corrections; of a folder, a frame for each scene."""
+    from holocal.app import batch, rendering
     from holocal.app.configuration import rig_config
+    from holocal.app.farm import farm_of
     from holocal.app.terminal import Terminal, emit, emit_json
 
     asked = rendering.Request(
-        scene=scene,
+        scene=scene[0],
         fov_deg=fov_deg,
         gaze_deg=gaze_deg,
         depth_m=depth_m,
@@ -89,11 +95,24 @@ def render(
         seed=seed,
         corrections=corrections,
     )
-    outputs = rendering.Outputs(frame=out, packing=packing, phase=phase_out, hologram=complex_out)
-    rendering.check(asked, outputs)
+    several = len(scene) > 1 or scene[0].is_dir()
+    path = out or Path("frames" if several else "frame.png")
+    outputs = rendering.Outputs(frame=path, packing=packing, phase=phase_out, hologram=complex_out)
+    if not several:
+        rendering.check(asked, outputs)
     config = rig_config(rig, set_ or [], device=options.checked_device(device))
+    farm = farm_of(workers, scheduler)
+    if several:
+        with Terminal() as terminal:
+            every = batch.render_all(config, asked, outputs, scene, farm=farm, said=terminal.counted("scene"))
+            terminal.say(f"{len(every['scenes'])} scenes, {every['total_seconds']:.1f} s in {farm}")
+        if json:
+            emit_json(every)
+        else:
+            emit(str(path))
+        return
     with Terminal() as terminal:
-        terminal.waiting(f"the hologram of {scene.name}")
+        terminal.waiting(f"the hologram of {scene[0].name}")
         said = rendering.render(config, asked, outputs)
         for sentence in said["skipped"][:3]:
             terminal.say(f"skipped: {sentence}", "yellow")

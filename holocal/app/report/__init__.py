@@ -6,6 +6,9 @@ numbers         numbers as they are read
 drawing         figures as PNG data, one style for all of them
 corner          the samples of a posterior, pair by pair
 template.html   the page
+study           the page of a tolerance study, study.html
+study_figures   its figures
+style.css       how both look
 ==============  ==========================================================
 """
 

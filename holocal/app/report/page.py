@@ -21,13 +21,16 @@ from holocal.records.files import read_json
 def page(directory: Path) -> str:
     """Return the report as HTML."""
     config = tomllib.loads((directory / "config.toml").read_text(encoding="utf-8"))
+    if config["procedure"] == "tolerance":
+        from holocal.app.report.study import study_page
+
+        return study_page(directory, config)
     result = _optional(directory / "result.json")
     error = _optional(directory / "error.json")
     journal = read_journal(directory)
     steps = [line for line in journal if line["event"] == "step"]
-    template = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    template.filters["number"] = number
-    return template.from_string(files(__package__).joinpath("template.html").read_text(encoding="utf-8")).render(
+    return filled(
+        "template.html",
         run=directory.name,
         config=config,
         result=result,
@@ -44,9 +47,18 @@ def page(directory: Path) -> str:
         environment=read_json(directory / "environment.json"),
         shots=_shots(journal),
         command=command(config),
-        version=__version__,
         scalars=_scalars(result),
     )
+
+
+def filled(name: str, **values: Any) -> str:
+    """Return a template of this package with values, in the house's style."""
+    here = files(__package__)
+    template = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    template.filters["number"] = number
+    style = here.joinpath("style.css").read_text(encoding="utf-8")
+    text = here.joinpath(name).read_text(encoding="utf-8")
+    return template.from_string(text).render(style=style, version=__version__, **values)
 
 
 def command(config: Mapping[str, Any]) -> str:
