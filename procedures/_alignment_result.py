@@ -74,7 +74,8 @@ def conclusion(state: State, frames: Sequence[Frame]) -> Conclusion:
         map_metadata={f"bench.{name}": float(v) for name, v in zip(DISPLACEMENTS, state.values[POSES], strict=True)},
         extent_deg=extent,
         extra={
-            "screws": screws_of(state, effects, sigma),
+            "screws": (screws := screws_of(state, effects, sigma)),
+            "tables": [_table(screws, moves)],
             "moves": moves,
             "directions": directions,
             "undetermined": [one["direction"] for one in directions if not one["determined"]],
@@ -143,6 +144,25 @@ def _sentence(
     )
 
 
+def _table(screws: list[dict[str, Any]], moves: dict[str, Any]) -> dict[str, Any]:
+    """Return the table of screws for the report."""
+    enough = "brings the bench" if moves["within_tolerance"] else "does not bring the bench"
+    return {
+        "title": "Screws",
+        "columns": ["screw", "stands at", "standard error", "shifts the picture, px", "wavefront, rad", "turn by"],
+        "rows": [
+            [
+                line["screw"].replace("_", " "), line["value"], line["sigma"], line["causes_px"], line["causes_rad"],
+                moves["moves"].get(line["screw"], ""),
+            ]
+            for line in screws
+        ],
+        "caption": f"Rotations in degrees, shifts in mm; what each does alone, rms over the field. Turning the marked "
+        f"{enough} within {moves['tolerance_px']:g} px and {moves['tolerance_rad']:g} rad: "
+        f"{moves['leaves_px']:.2g} px and {moves['leaves_rad']:.2g} rad are left.",
+    }  # fmt: skip
+
+
 def _zones_rad(effects: Effects, covariance: Array) -> Array:
     """Return the rms over the posterior of every lit zone's wavefront off its mean, radians."""
     strength, axes = np.linalg.eigh(covariance)
@@ -204,7 +224,7 @@ def _figures(
             "Predicted by rays over the bench that was found; rms over the pupil.", extent,
         ),
         Figure(
-            "posterior", "The twelve displacements, degrees and mm", "corner",
+            "posterior", "The twelve displacements", "corner",
             {
                 "samples": chain.samples, "laplace_mean": state.values[POSES],
                 "laplace_covariance": state.covariance[POSES, POSES],

@@ -106,6 +106,7 @@ class Conclusion:
     float32), `before_map` and `after_map` to ``before.exr`` and ``after.exr``; `calibration` holds what `accept` would
     put in force: JSON scalars here, arrays in `maps`. `parts` are the results of a run of several procedures, by their
     names, in the order in which they were measured; each is accepted as if it had been a run by itself.
+    `extra["tables"]` are for the report: each a `title`, `columns`, `rows` (lists of words and numbers), a `caption`.
     """
 
     before: dict[str, Any]

@@ -47,6 +47,7 @@ def page(directory: Path) -> str:
         environment=read_json(directory / "environment.json"),
         shots=_shots(journal),
         command=command(config),
+        tables=[] if result is None else result.get("tables", []),
         scalars=_scalars(result),
     )
 
@@ -96,6 +97,7 @@ def _scalars(result: Mapping[str, Any] | None) -> dict[str, Any]:
     known = {
         "schema", "procedure", "rig", "run", "targets_met", "outcome", "sentence", "frames", "preflight_frames",
         "steps", "seconds", "seed", "before", "after", "targets", "corrections", "truth",
+        "tables",
     }  # fmt: skip
     found = {} if result is None else {key: value for key, value in result.items() if key not in known}
     return {key: value for key, value in _flat(found).items() if not isinstance(value, list) or len(value) <= 8}
