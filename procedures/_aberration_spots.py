@@ -160,7 +160,7 @@ def spots_at(facts: RigFacts, wavelength_m: float, field_tan: Array, bench: Benc
         q = pupil[:, :, zone]
         low, high = q[inside].min(axis=0), q[inside].max(axis=0)
         centre[zone], half[zone] = (low + high) / 2, np.maximum((high - low) / 2, 1e-5)
-        down, right = np.gradient(q, axis=(0, 1))
+        down, right = (np.asarray(np.gradient(q, axis=axis)) for axis in (0, 1))
         cell = np.abs(down[..., 0] * right[..., 1] - down[..., 1] * right[..., 0])
         area[zone] = float(np.sum(passed[..., zone] * cell))
     lit = area / (np.pi * (facts.pupil_diameter_m / 2) ** 2)
